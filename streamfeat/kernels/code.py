@@ -1,0 +1,111 @@
+"""From the projection of a volume to its code in fixed point, and from codes to pooled features.
+
+Lives here: normalisation by the standard deviation, the soft threshold, the triangle encoding, pooling.
+Not here: the lasso (`lasso`), and which volume is encoded when (`update`).
+
+Floats are handled one by one in float32, without `fastmath`: no contraction and no reassociation, so
+the bits do not depend on how the loop is vectorised. Whatever is summed is an integer.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from streamfeat.kernels.layout import (
+    FIXED_POINT_ONE,
+    LARGEST_SQUARE,
+    MOMENT_LINEAR,
+    MOMENT_QUADRATIC,
+    MOMENT_SQUARES,
+    MOMENT_SUM,
+    SPLIT,
+    Operator,
+)
+
+
+@njit(cache=True, nogil=True)
+def deviation(moments: NDArray[np.int64], entries: int, eps: float) -> float:
+    """Standard deviation of a volume's entries, `sqrt(mean of squares - square of mean + eps)`."""
+    mean = moments[MOMENT_SUM] / entries
+    return math.sqrt(moments[MOMENT_SQUARES] / entries - mean * mean + eps)
+
+
+@njit(cache=True, nogil=True)
+def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator) -> float:
+    """`|x|^2` of a volume, from its quadratic and linear form; from 0 to LARGEST_SQUARE."""
+    quadratic = moments[MOMENT_QUADRATIC] * operator.quadratic_scale / (sigma * sigma)
+    linear = moments[MOMENT_LINEAR] * operator.linear_scale / sigma
+    return min(max(quadratic - 2.0 * linear + operator.constant, 0.0), LARGEST_SQUARE)
+
+
+@njit(cache=True, nogil=True)
+def soft_code(
+    projection: NDArray[np.int32], sigma: float, operator: Operator, code: NDArray[np.int32]
+) -> None:
+    """Closed-form code of the direct formulation: `sign(z) max(|z| - lambda0, 0)`, in fixed point.
+
+    Kostadinov and Scaramuzza, ICPR 2020/21, direct problem formulation, sparse coding step.
+    """
+    gain = np.float32(operator.scale * FIXED_POINT_ONE / sigma)
+    threshold = np.float32(operator.threshold)
+    for k in range(code.shape[0]):
+        z = np.float32(projection[k]) * gain - operator.offset[k]
+        code[k] = np.int32(z - min(max(z, -threshold), threshold))
+
+
+@njit(cache=True, nogil=True)
+def triangle_code(
+    projection: NDArray[np.int32],
+    sigma: float,
+    square: float,
+    operator: Operator,
+    code: NDArray[np.int32],
+) -> None:
+    """Triangle encoding `max(0, mean distance - distance)` (Coates, Ng and Lee 2011), in fixed point.
+
+    Args:
+        projection: `(Kp,)`.
+        sigma: standard deviation of the volume.
+        square: `|x|^2` of the whitened volume.
+        operator: scale, offset and squared norms.
+        code: `(Kp,)`, overwritten; zero beyond `n_filters`.
+    """
+    n_filters = operator.n_filters
+    gain = np.float32(operator.scale * FIXED_POINT_ONE / sigma)
+    one = np.float32(FIXED_POINT_ONE)
+    two = np.float32(2.0)
+    zero = np.float32(0.0)
+    length = np.float32(square)
+    total = np.int64(0)
+    for k in range(n_filters):
+        z = (np.float32(projection[k]) * gain - operator.offset[k]) / one
+        distance = np.sqrt(max(length - two * z + operator.square_norms[k], zero))
+        code[k] = np.int32(distance * one)
+        total += code[k]
+    mean = np.int32(total // n_filters)
+    for k in range(n_filters):
+        code[k] = max(mean - code[k], 0)
+    code[n_filters:] = 0
+
+
+@njit(cache=True, nogil=True)
+def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int64]) -> None:
+    """Add (`sign` 1) or take away (`sign` -1) the code of one volume from the sums of its quadrant.
+
+    Args:
+        code: `(Kp,)` fixed point; not changed.
+        sign: 1 or -1.
+        kind: SPLIT sums the positive and the negative part apart.
+        pooled: `(F,)`, changed.
+    """
+    width = code.shape[0]
+    if kind == SPLIT:
+        for k in range(width):
+            pooled[k] += sign * max(code[k], 0)
+        for k in range(width):
+            pooled[width + k] += sign * max(-code[k], 0)
+    else:
+        for k in range(width):
+            pooled[k] += sign * code[k]

@@ -1,0 +1,183 @@
+"""The inverse formulation's code: a lasso solved again from the code before it.
+
+Lives here: `min over l of 1/2 |x - D l|^2 + lambda0 |l|_1`, given `b = D' x`, `|x|^2` and the Gram
+matrix; coordinate descent over the active set (Friedman, Hastie and Tibshirani 2010, covariance
+updates), stopped by the duality gap (Fercoq, Gramfort and Salmon 2015, eq. 2 to 4).
+Not here: where `b` comes from, and pooling.
+
+The solution depends on where the solver starts, but only within the gap: it is a certificate.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from streamfeat.kernels.layout import FIXED_POINT_ONE, Operator
+
+MAX_ROUNDS = 1000
+"""Outer rounds, each a full look at all atoms; reached only where the gap is below float rounding."""
+
+MAX_SWEEPS = 50
+"""Sweeps over the active set in one round."""
+
+
+@njit(cache=True, nogil=True)
+def duality_gap(
+    residual: NDArray[np.float64],
+    right: NDArray[np.float64],
+    atoms: NDArray[np.float64],
+    square: float,
+    penalty: float,
+) -> float:
+    """Primal less dual objective of the lasso, from inner products alone.
+
+    Args:
+        residual: `(K,)` correlations of the residual, `D' (x - D l)`.
+        right: `(K,)` correlations `D' x`.
+        atoms: `(K,)` the code `l`.
+        square: `|x|^2`.
+        penalty: lambda0.
+    """
+    largest, l1, fit, cross = 0.0, 0.0, 0.0, 0.0
+    for k in range(right.shape[0]):
+        largest = max(largest, abs(residual[k]))
+        l1 += abs(atoms[k])
+        fit += atoms[k] * right[k]
+        cross += atoms[k] * residual[k]
+    remainder = max(square - fit - cross, 0.0)
+    shrink = min(1.0, penalty / max(largest, 1e-300))
+    # 1/2 |r|^2 + lambda |l|_1 less the dual value of the residual, shrunk until it is feasible.
+    return 0.5 * (1.0 + shrink * shrink) * remainder + penalty * l1 - shrink * (remainder + cross)
+
+
+@njit(cache=True, nogil=True)
+def solve_lasso(
+    right: NDArray[np.float64],
+    square: float,
+    penalty: float,
+    gram: NDArray[np.float32],
+    gap: float,
+    start: NDArray[np.float32],
+    atoms: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    active: NDArray[np.int64],
+) -> float:
+    """Solve the lasso by coordinate descent from a given code.
+
+    Args:
+        right: `(K,)` correlations `D' x`.
+        square: `|x|^2`.
+        penalty: lambda0, above zero.
+        gram: `(K, K)` inner products of the atoms.
+        gap: stop at this duality gap, relative to `1/2 |x|^2`.
+        start: `(K,)` code to start from.
+        atoms: `(K,)`, overwritten with the code.
+        residual: `(K,)`, overwritten with `D' (x - D l)`.
+        active: `(K,)` scratch.
+
+    Returns:
+        the duality gap that was reached, relative to `1/2 |x|^2`.
+    """
+    n_atoms = right.shape[0]
+    unit = max(0.5 * square, 1e-300)
+    for k in range(n_atoms):
+        atoms[k] = start[k]
+    reached = np.inf
+    for _ in range(MAX_ROUNDS):
+        # The residual is computed afresh: it cannot drift, however long a stream is.
+        for k in range(n_atoms):
+            residual[k] = right[k]
+        for j in range(n_atoms):
+            if atoms[j] != 0.0:
+                for k in range(n_atoms):
+                    residual[k] -= atoms[j] * gram[j, k]
+        reached = duality_gap(residual, right, atoms, square, penalty) / unit
+        if reached <= gap:
+            break
+        n_active = 0
+        for k in range(n_atoms):
+            if gram[k, k] > 0.0 and (atoms[k] != 0.0 or abs(residual[k]) > penalty):
+                active[n_active] = k
+                n_active += 1
+        descend(active[:n_active], penalty, gram, gap * unit, atoms, residual)
+    return reached
+
+
+@njit(cache=True, nogil=True)
+def descend(
+    active: NDArray[np.int64],
+    penalty: float,
+    gram: NDArray[np.float32],
+    tolerance: float,
+    atoms: NDArray[np.float64],
+    residual: NDArray[np.float64],
+) -> None:
+    """Sweep over the active atoms until their part of the duality gap is below the tolerance.
+
+    Args:
+        active: indices of the atoms to move.
+        penalty: lambda0.
+        gram: `(K, K)` inner products.
+        tolerance: absolute duality gap.
+        atoms: `(K,)`, changed at the active atoms.
+        residual: `(K,)`, kept current at the active atoms only.
+    """
+    for _ in range(MAX_SWEEPS):
+        for j in active:
+            scale = np.float64(gram[j, j])
+            target = residual[j] + scale * atoms[j]
+            value = (target - min(max(target, -penalty), penalty)) / scale
+            step = value - atoms[j]
+            if step != 0.0:
+                atoms[j] = value
+                row = gram[j]
+                for k in active:
+                    residual[k] -= step * row[k]
+        # With no active residual above the penalty the gap is lambda |l|_1 - l' residual (see duality_gap).
+        slack, excess = 0.0, 0.0
+        for k in active:
+            slack += penalty * abs(atoms[k]) - atoms[k] * residual[k]
+            excess = max(excess, abs(residual[k]) - penalty)
+        if slack <= 0.5 * tolerance and excess <= 1e-9 * penalty:
+            break
+
+
+@njit(cache=True, nogil=True)
+def lasso_code(
+    projection: NDArray[np.int32],
+    sigma: float,
+    square: float,
+    operator: Operator,
+    atoms: NDArray[np.float32],
+    work: NDArray[np.float64],
+    active: NDArray[np.int64],
+) -> None:
+    """Code of one volume under the inverse formulation, started from the code it had.
+
+    Args:
+        projection: `(Kp,)` of the volume.
+        sigma: standard deviation of the volume.
+        square: `|x|^2` of the whitened volume.
+        operator: scale, offset, threshold, Gram matrix and gap.
+        atoms: `(K,)` the code before; overwritten with the new one.
+        work: `(4, Kp)` scratch.
+        active: `(>= K,)` scratch.
+    """
+    n_atoms = atoms.shape[0]
+    right, solution, residual = work[0, :n_atoms], work[1, :n_atoms], work[2, :n_atoms]
+    gain = operator.scale / sigma
+    for k in range(n_atoms):
+        right[k] = projection[k] * gain - np.float64(operator.offset[k]) / FIXED_POINT_ONE
+    penalty = operator.threshold / FIXED_POINT_ONE
+    solve_lasso(right, square, penalty, operator.gram, operator.gap, atoms, solution, residual, active)
+    for k in range(n_atoms):
+        atoms[k] = np.float32(solution[k])
+
+
+@njit(cache=True, nogil=True)
+def fix_atoms(atoms: NDArray[np.float32], code: NDArray[np.int32]) -> None:
+    """Write a lasso code in fixed point; what an int32 cannot hold is clipped."""
+    limit = np.float64(2**31 - 1)
+    for k in range(atoms.shape[0]):
+        code[k] = np.int32(min(max(np.float64(atoms[k]) * FIXED_POINT_ONE, -limit), limit))
+    code[atoms.shape[0] :] = 0

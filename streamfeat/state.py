@@ -1,0 +1,63 @@
+"""Allocating the state that kernels change, and reading features out of it.
+
+Lives here: shapes of the arrays in `kernels.layout.State`, and the way from fixed point to float.
+Not here: what an event does to them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.events import Resolution
+from streamfeat.geometry import Geometry
+from streamfeat.kernels.layout import BEFORE_TIME, FIXED_POINT_ONE, SPLIT, Operator, State
+
+__all__ = ["allocate_state", "read_features"]
+
+
+def allocate_state(
+    geometry: Geometry, operator: Operator, resolution: Resolution, *, origin_us: int = 0, keep: bool = True
+) -> State:
+    """An empty state for one sensor.
+
+    Args:
+        geometry: of the local volumes.
+        operator: gives the number of filters and the encoding.
+        resolution: `(height, width)` of the sensor.
+        origin_us: start of bin 0.
+        keep: keep a projection for each volume; without, the state serves whole windows only.
+
+    Raises:
+        InputError: the sensor has no place for a volume.
+    """
+    rows, columns = geometry.grid_shape(resolution)
+    ring = (geometry.n_bins, *geometry.ring_shape(resolution))
+    volumes = rows * columns if keep else 1
+    padded = operator.offset.shape[0]
+    atoms = operator.n_filters if operator.inverse else 0
+    clock = np.zeros(4, np.int64)
+    clock[:2] = BEFORE_TIME
+    clock[3] = origin_us
+    return State(
+        counts=np.zeros(ring, np.int32),
+        applied=np.zeros(ring, np.int16),
+        touched=np.zeros(int(np.prod(ring)), np.int32),
+        is_touched=np.zeros(ring, np.uint8),
+        clock=clock,
+        tally=np.zeros(5, np.int64),
+        projections=np.zeros((volumes, padded), np.int32),
+        moments=np.zeros((volumes, 4), np.int64),
+        atoms=np.zeros((volumes, atoms), np.float32),
+        dirty=np.zeros(volumes, np.int32),
+        is_dirty=np.zeros(volumes, np.uint8),
+        pooled=np.zeros((4, 2 * padded if operator.kind == SPLIT else padded), np.int64),
+        code=np.zeros(padded, np.int32),
+        work=np.zeros((4, padded), np.float64),
+        active=np.zeros(padded, np.int64),
+        values=np.zeros(geometry.entries, np.int16),
+    )
+
+
+def read_features(operator: Operator, state: State) -> NDArray[np.float32]:
+    """The pooled sums quadrant by quadrant, without padding: `(4 K,)` float32, or `(8 K,)` for `split`."""
+    parts = state.pooled.reshape(4, -1, operator.offset.shape[0])[:, :, : operator.n_filters]
+    return (parts.reshape(-1) / FIXED_POINT_ONE).astype(np.float32)
