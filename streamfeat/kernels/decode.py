@@ -1,0 +1,120 @@
+"""Packet words to events, where each word depends on the ones before it.
+
+Lives here: the two encodings of 16-bit words, one short loop each, writing to `out`.
+Not here: payload checks, capacity, and the encodings of fixed-size records, which NumPy reads by itself;
+see `streamfeat.codecs`.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from streamfeat.events import Events
+
+__all__ = ["decode_evt3", "decode_libcaer_cmp"]
+
+# A TIME_HIGH that goes back by at most this many steps is a late word; by more, a wrap of its 12 bits.
+TIME_HIGH_BACKSTEP = 10
+
+
+@njit(cache=True, nogil=True)
+def decode_evt3(words: NDArray[np.uint16], state: NDArray[np.int64], out: Events) -> int:
+    """Decode EVT3 words; `state` carries what the next packet needs.
+
+    Args:
+        words: `(n,)` uint16, not changed.
+        state: `(6,)` int64, changed: time high with its wraps, time low, y, next x of a vector, polarity of
+            a vector, and what was seen (0 nothing, 1 TIME_HIGH, 2 then TIME_LOW, 3 then ADDR_Y, 4 then
+            VECT_BASE_X).
+        out: `EVENT_DTYPE`, changed; at least as long as the words can hold events.
+
+    Returns:
+        The number of events written.
+    """
+    high, low, y, base, polarity, seen = state
+    n = 0
+    for word in words:
+        kind = word >> 12
+        if kind == 0x2 and seen >= 3:  # ADDR_X
+            out[n].x = word & 0x7FF
+            out[n].y = y
+            out[n].p = (word >> 11) & 1
+            out[n].t = (high << 12) | low
+            n += 1
+        elif kind == 0x0 and seen >= 2:  # ADDR_Y
+            y = np.int64(word & 0x7FF)
+            seen = max(seen, 3)
+        elif kind == 0x3 and seen >= 3:  # VECT_BASE_X
+            base = np.int64(word & 0x7FF)
+            polarity = np.int64((word >> 11) & 1)
+            seen = np.int64(4)
+        elif (kind == 0x4 or kind == 0x5) and seen >= 4:  # VECT_12, VECT_8
+            width = 12 if kind == 0x4 else 8
+            for i in range(width):
+                if word >> i & 1:
+                    out[n].x = base + i
+                    out[n].y = y
+                    out[n].p = polarity
+                    out[n].t = (high << 12) | low
+                    n += 1
+            base = (base + width) & 0xFFFF
+        elif kind == 0x6 and seen >= 1:  # TIME_LOW
+            low = np.int64(word & 0xFFF)
+            seen = max(seen, 2)
+        elif kind == 0x8:  # TIME_HIGH
+            step = ((word & 0xFFF) - high) & 0xFFF
+            if step >= 0x1000 - TIME_HIGH_BACKSTEP and high + step >= 0x1000:
+                step -= 0x1000
+            high += step
+            seen = max(seen, 1)
+        # Triggers (0xA), vendor words (0xE, 0x7, 0xF) and reserved types carry no events.
+    state[0], state[1], state[2], state[3], state[4], state[5] = high, low, y, base, polarity, seen
+    return n
+
+
+@njit(cache=True, nogil=True)
+def decode_libcaer_cmp(words: NDArray[np.uint16], base_us: int, state: NDArray[np.int64], out: Events) -> int:
+    """Decode libcaer_cmp words; time starts again with each packet, addresses carry over.
+
+    Args:
+        words: `(n,)` uint16, not changed.
+        base_us: time of the packet, microseconds.
+        state: `(3,)` int64, changed: x, next y of a vector, polarity of a vector.
+        out: `EVENT_DTYPE`, changed; at least as long as the words can hold events.
+
+    Returns:
+        The number of events written, or `-1 - i` when word `i` is of no known type.
+    """
+    x, base, polarity = state
+    high = low = np.int64(0)
+    n = 0
+    for i, word in enumerate(words):
+        kind = word >> 12
+        if kind == 3:  # ADDR_Y
+            out[n].x = x
+            out[n].y = word & 0x7FF
+            out[n].p = (word >> 11) & 1
+            out[n].t = base_us + (high | low)
+            n += 1
+        elif kind == 2:  # ADDR_X
+            x = np.int64(word & 0x7FF)
+        elif kind == 1:  # TIME_LOW
+            low = np.int64(word & 0xFFF)
+        elif kind == 0:  # TIME_HIGH
+            high = np.int64(word & 0xFFF) << 12
+        elif kind == 4:  # VECT_BASE_Y
+            base = np.int64(word & 0x7FF)
+            polarity = np.int64((word >> 11) & 1)
+        elif kind == 5:  # VECT_8
+            for bit in range(8):
+                if word >> bit & 1:
+                    out[n].x = x
+                    out[n].y = base + bit
+                    out[n].p = polarity
+                    out[n].t = base_us + (high | low)
+                    n += 1
+            base = (base + 8) & 0xFFFF
+        else:
+            return -1 - i
+    state[0], state[1], state[2] = x, base, polarity
+    return n

@@ -1,0 +1,228 @@
+"""The records of an MCAP file in file order, whatever state the file is in.
+
+Lives here: framing, chunks, checksums, finding the next chunk behind damage, and counting what was lost.
+Not here: what messages mean (`streamfeat.recording`), and writing (`streamfeat.recorder`).
+
+The readers of the `mcap` package stop at the first damaged byte and believe every length they read. Here a
+length is compared with the file before it is used, one record is in memory at a time, and no record or
+uncompressed chunk may exceed `MAX_RECORD_BYTES`.
+"""
+
+import os
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message, Schema, Statistics
+
+__all__ = ["MAGIC", "MAX_RECORD_BYTES", "Losses", "Summary", "iter_records", "read_summary"]
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_RECORD_BYTES = 1 << 28
+_FRAME = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
+_SCAN_BYTES = 1 << 20
+
+# A chunk's header is recognised by its compression name; its two lengths must then agree.
+_CHUNK_HEAD = re.compile(rb"\x06(?=.{36}(?:\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd))", re.DOTALL)
+_CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 4 + 8
+
+_DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
+
+Record = Schema | Channel | Message
+
+
+@dataclass(slots=True)
+class Losses:
+    """What one pass over a recording could not read, by named reason."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    bytes: Counter[str] = field(default_factory=Counter)
+    first: dict[str, str] = field(default_factory=dict)
+    """For each reason, where it struck first and why."""
+
+    def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
+        """Count one loss."""
+        self.counts[reason] += count
+        self.bytes[reason] += n_bytes
+        self.first.setdefault(reason, where)
+
+    def __bool__(self) -> bool:
+        """Whether anything was lost."""
+        return bool(self.counts)
+
+
+@dataclass(slots=True)
+class Summary:
+    """What the end of an intact file says about it."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    message_counts: dict[int, int] = field(default_factory=dict)
+    """Messages of each channel id."""
+
+
+def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]:
+    """Yield schemas, channels and messages in file order, each with the byte where it starts.
+
+    Messages of a chunk carry the byte of the chunk. Damage is skipped up to the next readable record or
+    chunk and counted in `losses`, which is changed. Nothing is raised but `OSError`.
+    """
+    size = file.seek(0, os.SEEK_END)
+    at = len(MAGIC)
+    while True:
+        file.seek(at)
+        head = file.read(_FRAME.size)
+        if len(head) < _FRAME.size:
+            losses.add("truncated", len(head), f"byte {at}: the file ends without an end-of-data record")
+            return
+        opcode, length = _FRAME.unpack(head)
+        end = at + _FRAME.size + length
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return
+        if end > size or not (Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 0x80):
+            following = _find_chunk(file, at + 1, size)
+            reason = "truncated" if following is None and end > size else "damaged record"
+            losses.add(
+                reason,
+                (following or size) - at,
+                f"byte {at}: record type {opcode} with {length} bytes cannot be here",
+            )
+            if following is None:
+                return
+            end = following
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+            if length > MAX_RECORD_BYTES:
+                losses.add("oversized", length, f"byte {at}: a record of {length} bytes")
+            elif opcode == Opcode.CHUNK:
+                yield from _chunk_records(file.read(length), at, losses)
+            else:
+                yield from _one_record(opcode, file.read(length), at, losses)
+        at = end
+
+
+def read_summary(file: BinaryIO) -> Summary | None:
+    """Read the summary section, or give None when it is absent, damaged or not what its CRC says."""
+    size = file.seek(0, os.SEEK_END)
+    footer_at = size - _FOOTER.size - _FRAME.size - len(MAGIC) + 9
+    if footer_at < len(MAGIC):
+        return None
+    file.seek(footer_at)
+    footer = file.read(_FOOTER.size)
+    opcode, length, start, _, crc = _FOOTER.unpack(footer)
+    if opcode != Opcode.FOOTER or length != _FOOTER.size - _FRAME.size or file.read(len(MAGIC)) != MAGIC:
+        return None
+    if not len(MAGIC) <= start < footer_at or footer_at - start > MAX_RECORD_BYTES:
+        return None
+    file.seek(start)
+    section = file.read(footer_at - start)
+    if crc not in (0, zlib.crc32(footer[:-4], zlib.crc32(section))):
+        return None
+    return _parse_summary(section)
+
+
+def _parse_summary(section: bytes) -> Summary | None:
+    summary = Summary()
+    at = 0
+    try:
+        while at < len(section):
+            opcode, length = _FRAME.unpack_from(section, at)
+            at += _FRAME.size + length
+            body = ReadDataStream(BytesIO(section[at - length : at]))
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(body)
+                summary.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(body)
+                summary.channels[channel.id] = channel
+            elif opcode == Opcode.STATISTICS:
+                summary.message_counts = Statistics.read(body).channel_message_counts
+    except _DAMAGE:
+        return None
+    return summary if summary.channels else None
+
+
+def _one_record(opcode: int, body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
+    stream = ReadDataStream(BytesIO(body))
+    record: Record
+    try:
+        if opcode == Opcode.MESSAGE:
+            record = Message.read(stream, len(body))
+        elif opcode == Opcode.CHANNEL:
+            record = Channel.read(stream)
+        else:
+            record = Schema.read(stream)
+    except _DAMAGE as error:
+        losses.add("damaged record", len(body), f"byte {at}: {error or type(error).__name__}")
+    else:
+        yield at, record
+
+
+def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
+    try:
+        data = _decompress(Chunk.read(ReadDataStream(BytesIO(body))))
+    except _DAMAGE as error:
+        losses.add("damaged chunk", len(body), f"byte {at}: {error or type(error).__name__}")
+        return
+    inner = 0
+    while inner < len(data):
+        start = inner + _FRAME.size
+        opcode, length = _FRAME.unpack_from(data, inner) if start <= len(data) else (0, 0)
+        if opcode == 0 or start + length > len(data):
+            losses.add("damaged chunk", len(data) - inner, f"byte {at}: record {inner} bytes in does not fit")
+            return
+        inner = start + length
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield from _one_record(opcode, data[start:inner], at, losses)
+
+
+def _decompress(chunk: Chunk) -> bytes:
+    """Uncompress a chunk, never to more than it claims, and check its CRC."""
+    claimed = chunk.uncompressed_size
+    if claimed > MAX_RECORD_BYTES:
+        raise ValueError(f"the chunk claims {claimed} bytes, the limit is {MAX_RECORD_BYTES}")
+    if chunk.compression == "zstd":
+        # `zstandard.decompress` believes the size in the frame; the stream reader takes ours.
+        try:
+            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(claimed + 1)
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from None
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=claimed + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"unknown compression {chunk.compression!r}")
+    if len(data) != claimed:
+        raise ValueError(f"the chunk claims {claimed} bytes and holds {len(data)}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("the CRC of the chunk does not match")
+    return bytes(data)
+
+
+def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:
+    """Find the next byte where a whole chunk starts."""
+    for window in range(start, size, _SCAN_BYTES):
+        file.seek(window)
+        block = file.read(_SCAN_BYTES + _CHUNK_HEAD_BYTES + 4)
+        for match in _CHUNK_HEAD.finditer(block, 0):
+            head = block[match.start() :]
+            (length,) = struct.unpack_from("<Q", head, 1)
+            (name_length,) = struct.unpack_from("<I", head, 37)
+            if len(head) < 49 + name_length:
+                continue
+            (data_length,) = struct.unpack_from("<Q", head, 41 + name_length)
+            at = window + match.start()
+            if length == 40 + name_length + data_length and at + _FRAME.size + length <= size:
+                return at
+    return None

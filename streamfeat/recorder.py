@@ -1,0 +1,226 @@
+"""Writing recordings: events, labels, features and predictions into an MCAP file.
+
+Lives here: `RecordingWriter`; cutting batches into packets, and never leaving half a file in place.
+Not here: reading (`streamfeat.recording`), what bytes a message has (`streamfeat.messages`).
+"""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import ArrayLike
+
+from streamfeat.codecs import encode, make_decoder
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.recording import Label
+
+__all__ = ["RecordingWriter"]
+
+PACKET_EVENTS = 8192
+PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
+
+_COMPRESSION = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+_Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
+
+
+class RecordingWriter:
+    """Write one recording; a context manager.
+
+    Everything goes to `<path>.part` first. Leaving the block renames it to `path`; leaving it with an
+    exception removes it, or leaves it for `streamfeat recover` when `keep_partial` is set. An existing file
+    at `path` is untouched until the rename.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        *,
+        encoding: str = "mono",
+        compression: Literal["zstd", "lz4", "none"] = "zstd",
+        event_topic: str = "/events",
+        frame_id: str = "",
+        overwrite: bool = False,
+        keep_partial: bool = False,
+        chunk_size: int = 1 << 20,
+    ) -> None:
+        """Open the temporary file.
+
+        Args:
+            path: the file to write.
+            encoding: of event payloads, one of `streamfeat.codecs.ENCODINGS`.
+            compression: of chunks.
+            event_topic: topic of the events; labels, features and predictions go to `/label`, `/features`
+                and `/prediction`.
+            frame_id: frame in the header of every message.
+            overwrite: whether an existing file at `path` may be replaced.
+            keep_partial: whether an exception leaves what was written so far.
+            chunk_size: bytes before compression that one damaged spot in the file can cost.
+
+        Raises:
+            InputError: the encoding or compression is unknown, or the file exists or cannot be written.
+        """
+        make_decoder(encoding)
+        if compression not in _COMPRESSION:
+            raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
+        self.path = Path(path)
+        self._part = self.path.with_name(self.path.name + ".part")
+        self._overwrite, self._keep_partial = overwrite, keep_partial
+        self._encoding, self._event_topic, self._frame_id = encoding, event_topic, frame_id
+        self._channels: dict[str, int] = {}
+        self._seq = 0
+        self._after_us = 0
+        self._check_target()
+        try:
+            self._file = self._part.open("xb")
+        except FileExistsError:
+            raise InputError(
+                f"{self._part}: left by a writer that did not finish, or is still at work; save it with "
+                f"`streamfeat recover`, or delete it"
+            ) from None
+        except OSError as error:
+            raise InputError(f"{self._part}: cannot be written: {error.strerror}") from None
+        self._writer = Writer(self._file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
+        self._writer.start(profile="ros2", library="streamfeat")
+
+    def __enter__(self) -> Self:
+        """Give the writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finish the file and move it into place, or drop it after an exception."""
+        if kind is None:
+            self.close()
+        else:
+            self._abandon()
+
+    def close(self) -> None:
+        """Finish the file and move it into place; a second call does nothing.
+
+        Raises:
+            InputError: meanwhile a file appeared at `path` and `overwrite` is not set.
+        """
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+            self._check_target()
+        except BaseException:
+            self._abandon()
+            raise
+        self._part.replace(self.path)
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system, so that a crash cannot take it."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def write_events(self, events: Events, resolution: Resolution) -> None:
+        """Write a batch as one or more packets, each at the time of its first event.
+
+        Args:
+            events: `(n,)` array of `EVENT_DTYPE`, not changed; n may be 0, which writes nothing.
+            resolution: `(height, width)` of the sensor.
+
+        Raises:
+            InputError: the encoding cannot represent the events (see `streamfeat.codecs.encode`), or a
+                time is negative or 2^31 s or more.
+        """
+        start = 0
+        while start < len(events):
+            block = events[start : start + PACKET_EVENTS]
+            far = np.flatnonzero(np.abs(block["t"] - block["t"][0]) >= PACKET_US)
+            block = block[: far[0]] if len(far) else block
+            self._write_packet(block, resolution)
+            start += len(block)
+
+    def write_label(self, label: Label) -> None:
+        """Write a label; do so before the events it speaks of.
+
+        Raises:
+            InputError: start or duration is out of range.
+        """
+        message = LabelMessage(
+            label.start_us * 1000,
+            self._frame_id,
+            label.duration_us * 1000,
+            label.label,
+            label.split,
+            label.source,
+        )
+        self._write("/label", message)
+
+    def write_features(self, t_us: int, n_events: int, data: ArrayLike) -> None:
+        """Write the features at a stream time.
+
+        Args:
+            t_us: stream time, microseconds.
+            n_events: events that went into them.
+            data: `(n,)`, stored as float32, not changed.
+
+        Raises:
+            InputError: the time is out of range.
+        """
+        values = np.asarray(data, np.float32)
+        self._write("/features", FeaturesMessage(t_us * 1000, self._frame_id, n_events, values))
+
+    def write_prediction(self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike) -> None:
+        """Write a prediction at a stream time.
+
+        Args:
+            t_us: stream time, microseconds.
+            label: the winner.
+            labels: all labels.
+            scores: `(len(labels),)`, stored as float32, not changed.
+
+        Raises:
+            InputError: the time is out of range.
+        """
+        values = np.asarray(scores, np.float32)
+        self._write("/prediction", PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
+
+    def _write_packet(self, events: Events, resolution: Resolution) -> None:
+        payload, time_base_ns = encode(events, self._encoding, self._after_us)
+        height, width = resolution
+        packet = EventPacket(
+            int(events["t"].min()) * 1000,
+            self._frame_id,
+            height,
+            width,
+            self._seq,
+            time_base_ns,
+            self._encoding,
+            False,
+            payload,
+        )
+        self._write(self._event_topic, packet)
+        self._seq += 1
+        self._after_us = int(events["t"][-1])
+
+    def _write(self, topic: str, message: _Message) -> None:
+        data = message.to_cdr()
+        if topic not in self._channels:
+            schema = self._writer.register_schema(message.SCHEMA_NAME, "ros2msg", message.SCHEMA.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        self._writer.add_message(self._channels[topic], message.stamp_ns, data, message.stamp_ns)
+
+    def _check_target(self) -> None:
+        if self.path.exists() and not self._overwrite:
+            raise InputError(f"{self.path}: exists already; choose another name or allow to overwrite it")
+
+    def _abandon(self) -> None:
+        self._file.close()
+        if not self._keep_partial:
+            self._part.unlink(missing_ok=True)

@@ -1,0 +1,375 @@
+"""Reading recordings: batches, packets, labels and labelled samples out of an MCAP file.
+
+Lives here: `open_recording` and what it gives; choosing the topic, decoding, counting.
+Not here: the file format and its damage (`streamfeat.mcap_records`), writing (`streamfeat.recorder`).
+
+A recording is read in file order with one packet in memory at a time. What cannot be read is skipped and
+counted in `Recording.losses`; only a recording that yields nothing at all is an error.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+import numpy as np
+from mcap.records import Channel, Message, Schema
+
+from streamfeat.codecs import Decoder, make_decoder
+from streamfeat.errors import InputError
+from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.mcap_records import MAGIC, Losses, Summary, iter_records, read_summary
+from streamfeat.messages import EventArray, EventPacket, LabelMessage
+
+__all__ = ["Label", "Losses", "Packet", "Recording", "Sample", "Topic", "open_recording"]
+
+_EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
+_MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a recording."""
+
+    name: str
+    schema: str
+    schema_encoding: str
+    n_messages: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Packet:
+    """One message of events; `log_time_ns` is when it was recorded, `seq` its number at the source."""
+
+    topic: str
+    events: Events
+    resolution: Resolution
+    log_time_ns: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A labelled sample: the events in `[start_us, start_us + duration_us)`."""
+
+    start_us: int
+    duration_us: int
+    label: str
+    split: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """A label, its events in stored order, and the resolution of the packets they came in."""
+
+    label: Label
+    events: Events
+    resolution: Resolution
+
+
+@dataclass(slots=True)
+class _Totals:
+    """What only a full pass can tell."""
+
+    labels: list[Label] = field(default_factory=list)
+    n_on: int = 0
+    n_off: int = 0
+    first_us: int | None = None
+    last_us: int | None = None
+
+    def add(self, events: Events) -> None:
+        if len(events) == 0:
+            return
+        on = int(np.count_nonzero(events["p"]))
+        self.n_on += on
+        self.n_off += len(events) - on
+        first, last = int(events["t"].min()), int(events["t"].max())
+        self.first_us = first if self.first_us is None else min(first, self.first_us)
+        self.last_us = last if self.last_us is None else max(last, self.last_us)
+
+
+def open_recording(path: str | PathLike[str], topic: str | None = None) -> "Recording":
+    """Open an MCAP recording of events.
+
+    Args:
+        path: the file.
+        topic: the event topic to read; may be left out when there is only one.
+
+    Raises:
+        InputError: the file is missing, empty or no MCAP; it has no event topic, several and none was
+            chosen, or not the chosen one; or not a single packet of the topic can be read.
+    """
+    return Recording(path, topic)
+
+
+class Recording:
+    """A recording of events, read in file order; iterate as often as you like.
+
+    `losses` tells what the latest pass (iteration, or one of the counts) could not read.
+    """
+
+    path: Path
+    topics: list[Topic]
+    topic: str
+    resolution: Resolution
+    encoding: str
+    losses: Losses
+
+    def __init__(self, path: str | PathLike[str], topic: str | None = None) -> None:
+        """See `open_recording`."""
+        self.path = Path(path)
+        self._file = _open_mcap(self.path)
+        try:
+            summary = read_summary(self._file)
+            # Counts from a summary tell what should be there; a scan can only tell what is.
+            self._expected = summary.message_counts if summary else {}
+            self._known = summary or _scan(self._file)
+            self.topics = _topics(self._known)
+            self.topic = _choose_topic(
+                self.path, [t for t in self.topics if t.schema in _EVENT_SCHEMAS], topic
+            )
+            self.losses = Losses()
+            self.encoding = ""
+            self.resolution = self._first_packet().resolution
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        """Give the recording itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; iterating after that is an error."""
+        self._file.close()
+
+    def __iter__(self) -> Iterator[Events]:
+        """Yield batches of events in stored order: `(n,)` arrays of `EVENT_DTYPE`, n > 0."""
+        for item in self.items():
+            if isinstance(item, Packet) and len(item.events):
+                yield item.events
+
+    def items(self) -> Iterator[Packet | Label]:
+        """Yield packets and labels in stored order; a label comes before its first packet."""
+        losses = self.losses = Losses()
+        decoders: dict[str, Decoder] = {}
+        seen: Counter[int] = Counter()
+        last_seq: int | None = None
+        for at, channel, schema, message in self._messages(losses):
+            is_label = schema.name == LabelMessage.SCHEMA_NAME
+            if not is_label and channel.topic != self.topic:
+                continue
+            seen[channel.id] += 1
+            item: Packet | Label
+            try:
+                if is_label:
+                    item = _read_label(message.data)
+                elif schema.name == EventArray.SCHEMA_NAME:
+                    item = self._read_array(message)
+                else:
+                    packet = EventPacket.from_cdr(message.data)
+                    if last_seq is not None and packet.seq > last_seq + 1:
+                        for decoder in decoders.values():
+                            decoder.resync()
+                    last_seq = packet.seq
+                    item = self._read_packet(packet, message, decoders)
+            except InputError as error:
+                where = f"topic {channel.topic}, message {seen[channel.id]} (byte {at}): {error}"
+                losses.add("bad label" if is_label else "bad packet", len(message.data), where)
+            else:
+                yield item
+        for channel_id in self._expected:
+            self._count_missing(channel_id, seen[channel_id], losses)
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the labelled samples in stored order, with memory bounded by those open at a time.
+
+        A sample is complete when a packet starts, or a label begins, at or after its end.
+        """
+        open_samples: list[tuple[Label, list[Packet]]] = []
+        for item in self.items():
+            now = item.start_us if isinstance(item, Label) else _start_us(item)
+            while now is not None and open_samples and now >= _end_us(open_samples[0][0]):
+                yield self._sample(*open_samples.pop(0))
+            if isinstance(item, Label):
+                open_samples.append((item, []))
+            else:
+                for _, packets in open_samples:
+                    packets.append(item)
+        for label, packets in open_samples:
+            yield self._sample(label, packets)
+
+    @cached_property
+    def _totals(self) -> _Totals:
+        totals = _Totals()
+        for item in self.items():
+            if isinstance(item, Label):
+                totals.labels.append(item)
+            else:
+                totals.add(item.events)
+        return totals
+
+    @property
+    def labels(self) -> list[Label]:
+        """All labels in stored order; the first use reads the whole file, as for the counts below."""
+        return self._totals.labels
+
+    @property
+    def n_on(self) -> int:
+        """Number of ON events."""
+        return self._totals.n_on
+
+    @property
+    def n_off(self) -> int:
+        """Number of OFF events."""
+        return self._totals.n_off
+
+    @property
+    def n_events(self) -> int:
+        """Number of events."""
+        return self.n_on + self.n_off
+
+    @property
+    def first_us(self) -> int | None:
+        """Time of the earliest event, or None without events."""
+        return self._totals.first_us
+
+    @property
+    def last_us(self) -> int | None:
+        """Time of the latest event, or None without events."""
+        return self._totals.last_us
+
+    @property
+    def duration_us(self) -> int:
+        """Time from the earliest to the latest event."""
+        return (self.last_us or 0) - (self.first_us or 0)
+
+    def _messages(self, losses: Losses) -> Iterator[tuple[int, Channel, Schema, Message]]:
+        # Channels of the summary stand in for those in a damaged first chunk.
+        channels, schemas = dict(self._known.channels), dict(self._known.schemas)
+        for at, record in iter_records(self._file, losses):
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            else:
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    losses.add("unknown channel", len(record.data), f"byte {at}: channel {record.channel_id}")
+                elif channel.schema_id in schemas:
+                    yield at, channel, schemas[channel.schema_id], record
+
+    def _first_packet(self) -> Packet:
+        for item in self.items():
+            if isinstance(item, Packet):
+                return item
+        reasons = list(self.losses.first.values()) or ["it has no messages"]
+        raise InputError(f"{self.path}: nothing can be read from topic {self.topic}: {reasons[0]}")
+
+    def _read_packet(self, packet: EventPacket, message: Message, decoders: dict[str, Decoder]) -> Packet:
+        if packet.is_bigendian:
+            raise InputError("big-endian payloads are not supported; record with is_bigendian false")
+        if packet.encoding not in decoders:
+            decoders[packet.encoding] = make_decoder(packet.encoding)
+        events = decoders[packet.encoding].decode(packet.events, packet.time_base)
+        resolution = _resolution(packet.height, packet.width)
+        self.encoding = packet.encoding
+        return Packet(self.topic, events, resolution, message.log_time, packet.seq)
+
+    def _read_array(self, message: Message) -> Packet:
+        array = EventArray.from_cdr(message.data)
+        resolution = _resolution(array.height, array.width)
+        self.encoding = "dvs_msgs"
+        return Packet(self.topic, array.events, resolution, message.log_time, message.sequence)
+
+    def _count_missing(self, channel_id: int, seen: int, losses: Losses) -> None:
+        channel = self._known.channels.get(channel_id)
+        missing = self._expected.get(channel_id, 0) - seen
+        if channel is None or missing <= 0:
+            return
+        schema = self._known.schemas.get(channel.schema_id)
+        if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
+            losses.add("missing message", 0, f"topic {channel.topic}: {missing} not found", missing)
+
+    def _sample(self, label: Label, packets: list[Packet]) -> Sample:
+        events = np.concatenate([p.events for p in packets] or [np.zeros(0, EVENT_DTYPE)])
+        inside = (events["t"] >= label.start_us) & (events["t"] < _end_us(label))
+        return Sample(label, events[inside], packets[0].resolution if packets else self.resolution)
+
+
+def _open_mcap(path: Path) -> BinaryIO:
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    magic = file.read(len(MAGIC))
+    if magic != MAGIC:
+        file.close()
+        what = "is empty" if not magic else "is not an MCAP recording"
+        raise InputError(f"{path}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
+    return file
+
+
+def _scan(file: BinaryIO) -> Summary:
+    """Build what a summary would say, from the records that are there."""
+    found, counts = Summary(), Counter[int]()
+    for _, record in iter_records(file, Losses()):
+        if isinstance(record, Channel):
+            found.channels[record.id] = record
+        elif isinstance(record, Schema):
+            found.schemas[record.id] = record
+        else:
+            counts[record.channel_id] += 1
+    found.message_counts = dict(counts)
+    return found
+
+
+def _topics(known: Summary) -> list[Topic]:
+    """List the topics; several channels of one topic and schema are one."""
+    counts: dict[tuple[str, str, str], int] = {}
+    for channel in known.channels.values():
+        schema = known.schemas.get(channel.schema_id)
+        key = (channel.topic, schema.name if schema else "", schema.encoding if schema else "")
+        counts[key] = counts.get(key, 0) + known.message_counts.get(channel.id, 0)
+    return [Topic(*key, n_messages=n) for key, n in counts.items()]
+
+
+def _choose_topic(path: Path, topics: list[Topic], wanted: str | None) -> str:
+    names = sorted({t.name for t in topics if t.schema in _EVENT_SCHEMAS})
+    if not names:
+        raise InputError(f"{path}: no topic carries {' or '.join(_EVENT_SCHEMAS)}; is this the right file?")
+    if wanted is None and len(names) > 1:
+        raise InputError(f"{path}: several topics carry events, choose one of {', '.join(names)}")
+    if wanted is not None and wanted not in names:
+        raise InputError(f"{path}: no events on topic {wanted}; topics with events: {', '.join(names)}")
+    return wanted or names[0]
+
+
+def _resolution(height: int, width: int) -> Resolution:
+    if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE):
+        raise InputError(f"a sensor of height {height} and width {width} is not possible")
+    return height, width
+
+
+def _read_label(data: bytes) -> Label:
+    m = LabelMessage.from_cdr(data)
+    return Label(m.stamp_ns // 1000, m.duration_ns // 1000, m.label, m.split, m.source)
+
+
+def _start_us(packet: Packet) -> int | None:
+    return int(packet.events["t"].min()) if len(packet.events) else None
+
+
+def _end_us(label: Label) -> int:
+    return label.start_us + label.duration_us
