@@ -5,16 +5,16 @@ Not here: learning the matrices (`learn`), and anything that changes as events c
 """
 
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from streamfeat.errors import InputError
@@ -30,6 +30,7 @@ from streamfeat.kernels.layout import (
     TRIANGLE,
     Operator,
 )
+from streamfeat.safe_arrays import one_line, read_safetensors
 from streamfeat.window import encode_window
 
 __all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "Formulation"]
@@ -134,6 +135,14 @@ class Encoder:
         return encoder
 
     @property
+    def fingerprint(self) -> str:
+        """SHA-256 over everything that decides what features are."""
+        digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
+        for value in self.operator:
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return digest.hexdigest()
+
+    @property
     def n_filters(self) -> int:
         """Number of filters or atoms, `K`."""
         return self.operator.n_filters
@@ -195,7 +204,7 @@ class Encoder:
         try:
             return cls._from_parts(arrays, header)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"{path}: not a usable model: {_one_line(error)}; learn it again") from error
+            raise InputError(f"{path}: not a usable model: {one_line(error)}; learn it again") from error
 
     @classmethod
     def _from_parts(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> Self:
@@ -207,11 +216,8 @@ class Encoder:
         scalars = {name: float(header["scalars"][name]) for name in _STORED_SCALARS}
         if not all(math.isfinite(value) for value in scalars.values()):
             raise InputError("a scalar is not finite")
-        operator = Operator(
-            **_fixed_fields(geometry, formulation, encoding, threshold, filters),
-            **{name: arrays[name] for name in _STORED_ARRAYS},
-            **scalars,
-        )
+        fields = _fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
+        operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in _STORED_ARRAYS})
         provenance = header.get("provenance", {})
         if not isinstance(provenance, dict):
             raise InputError("provenance is not a JSON object")
@@ -230,35 +236,6 @@ class Encoder:
 
 _STORED_ARRAYS = ("columns", "offset", "quadratic", "linear", "square_norms")
 _STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "gap")
-
-
-def _one_line(error: BaseException) -> str:
-    text = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
-    return " ".join(text.split())
-
-
-def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Read all arrays of a safetensors file and the JSON header that streamfeat keeps with them.
-
-    Raises:
-        InputError: the file cannot be read, or its header is not of this kind and version.
-    """
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {}).get("streamfeat", "null"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: not a readable safetensors file: {_one_line(error)}") from error
-    if not isinstance(header, dict) or header.get("format") != kind:
-        raise InputError(f"{path}: a safetensors file, but not a {kind} file")
-    if header.get("version") != version:
-        raise InputError(
-            f"{path}: format version {header.get('version')!r}, this streamfeat reads version {version}; "
-            "make the file again"
-        )
-    return arrays, header
 
 
 def _check_parameters(

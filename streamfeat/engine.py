@@ -146,9 +146,9 @@ class Engine:
 
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
-        tally = [int(value) for value in self._state.tally]
+        events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)
         active = int(np.count_nonzero(self._state.moments[:, MOMENT_SQUARES]))
-        return EngineStats(*tally, active_volumes=active, encoded_volumes=self._encoded)
+        return EngineStats(events, late, rejected, saturated, rolls, active, self._encoded)
 
     def restart(self, origin_us: int) -> None:
         """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted."""

@@ -9,7 +9,7 @@ The solution depends on where the solver starts, but only within the gap: it is 
 """
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from streamfeat.kernels.layout import FIXED_POINT_ONE, Operator
@@ -181,3 +181,35 @@ def fix_atoms(atoms: NDArray[np.float32], code: NDArray[np.int32]) -> None:
     for k in range(atoms.shape[0]):
         code[k] = np.int32(min(max(np.float64(atoms[k]) * FIXED_POINT_ONE, -limit), limit))
     code[atoms.shape[0] :] = 0
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def solve_lasso_rows(
+    right: NDArray[np.float32],
+    squares: NDArray[np.float64],
+    penalty: float,
+    gram: NDArray[np.float32],
+    gap: float,
+    codes: NDArray[np.float32],
+) -> None:
+    """Solve one lasso for each row, each from the code that is there.
+
+    Args:
+        right: `(n, K)` correlations, a row for each problem.
+        squares: `(n,)` `|x|^2` of each.
+        penalty: lambda0.
+        gram: `(K, K)` inner products of the atoms.
+        gap: relative duality gap.
+        codes: `(n, K)`, overwritten.
+    """
+    n, n_atoms = codes.shape
+    blocks = 64
+    for block in prange(blocks):
+        wide = np.empty((3, n_atoms))
+        active = np.empty(n_atoms, np.int64)
+        for i in range(n * block // blocks, n * (block + 1) // blocks):
+            for k in range(n_atoms):
+                wide[0, k] = right[i, k]
+            solve_lasso(wide[0], squares[i], penalty, gram, gap, codes[i], wide[1], wide[2], active)
+            for k in range(n_atoms):
+                codes[i, k] = wide[1, k]

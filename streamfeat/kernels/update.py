@@ -191,15 +191,7 @@ def apply_touched(shape: tuple[int, int], operator: Operator, state: State) -> i
                 if operator.quadratic.shape[0]:
                     gather_volume(applied, (now + 1) % n_bins, top, left, operator.patch, state.values)
                 entry = (position * operator.patch + row - top) * operator.patch + column - left
-                change_entry(
-                    entry,
-                    before,
-                    after,
-                    state.values,
-                    operator,
-                    state.projections[volume],
-                    state.moments[volume],
-                )
+                change_entry(entry, before, after, state.values, operator, projection, moments)
         applied[slot, row, column] = after
     for i in range(n_dirty):
         volume = state.dirty[i]

@@ -1,0 +1,289 @@
+"""From features to labels: the frozen linear classifier, and the one that learns online.
+
+Lives here: normalising pooled features, training with cross-validation, saving, predicting, updating.
+Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors.numpy import save
+from sklearn.linear_model import SGDClassifier
+from sklearn.model_selection import GridSearchCV, StratifiedKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+
+from streamfeat.encoder import Encoder
+from streamfeat.errors import InputError
+from streamfeat.files import write_atomically
+from streamfeat.safe_arrays import read_safetensors
+from streamfeat.svm import LinearSVM
+
+__all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
+
+FORMAT_VERSION = 1
+
+
+def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Signed square root of pooled features, then unit length (Perronnin et al. 2010, section 3.1 and 3.2).
+
+    Args:
+        features: `(n, F)` or `(F,)` float32; not changed.
+
+    Returns:
+        same shape; all zero where the features are.
+    """
+    rooted = np.sign(features) * np.sqrt(np.abs(features))
+    length = np.sqrt(np.square(rooted).sum(axis=-1, keepdims=True))
+    return np.asarray(rooted / np.where(length > 0, length, 1), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Classifier:
+    """A frozen linear classifier over the features of one encoder.
+
+    Attributes:
+        labels: names of the classes.
+        centre: `(F,)` float32, mean of the normalised features in training.
+        scale: `(F,)` float32, their standard deviation, never zero.
+        weights: `(F, C)` float32, or `(F, 1)` for two classes, in favour of the second.
+        bias: `(C,)` or `(1,)` float32.
+        fingerprint: of the encoder it was trained with.
+        provenance: how it was trained (JSON values).
+    """
+
+    labels: tuple[str, ...]
+    centre: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    fingerprint: str
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def untrained(cls, labels: Sequence[str], encoder: Encoder) -> Self:
+        """A classifier of zeros, for learning online from nothing.
+
+        Raises:
+            InputError: there are fewer than two labels.
+        """
+        names = tuple(sorted(set(labels)))
+        if len(names) < 2:
+            raise InputError(f"{len(names)} label is not enough to classify; at least two are needed")
+        n, columns = encoder.n_features, 1 if len(names) == 2 else len(names)
+        return cls(
+            labels=names,
+            centre=np.zeros(n, np.float32),
+            scale=np.full(n, 1 / np.sqrt(n), np.float32),
+            weights=np.zeros((n, columns), np.float32),
+            bias=np.zeros(columns, np.float32),
+            fingerprint=encoder.fingerprint,
+        )
+
+    def prepare(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Normalise and standardise features `(F,)` or `(n, F)`, as the weights expect them."""
+        return (normalise_features(features) - self.centre) / self.scale
+
+    def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Score of every label: `(C,)` for features `(F,)`, `(n, C)` for `(n, F)`."""
+        return _spread(self.prepare(features) @ self.weights + self.bias)
+
+    def predict(self, features: NDArray[np.float32]) -> str:
+        """The label with the highest score for features `(F,)`."""
+        return self.labels[int(self.scores(features).argmax())]
+
+    def check_fits(self, encoder: Encoder, *, path: str | Path = "the classifier") -> None:
+        """Refuse an encoder other than the one it was trained with.
+
+        Raises:
+            InputError: they do not belong together.
+        """
+        if len(self.centre) != encoder.n_features:
+            raise InputError(
+                f"{path}: expects {len(self.centre)} features, the model gives {encoder.n_features}; "
+                "train it with this model"
+            )
+        if self.fingerprint != encoder.fingerprint:
+            raise InputError(f"{path}: was trained with another model; train it with this one")
+
+    def save(self, path: str | Path) -> None:
+        """Write one safetensors file; the file appears whole or not at all."""
+        arrays = {name: getattr(self, name) for name in ("centre", "scale", "weights", "bias")}
+        header = {
+            "format": "streamfeat-classifier",
+            "version": FORMAT_VERSION,
+            "labels": list(self.labels),
+            "fingerprint": self.fingerprint,
+            "provenance": dict(self.provenance),
+        }
+        write_atomically(Path(path), save(arrays, metadata={"streamfeat": json.dumps(header)}))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a classifier; every shape, type and range is checked, and nothing in the file is run.
+
+        Raises:
+            InputError: the file is missing, cut short, of another version, or not a classifier.
+        """
+        arrays, header = read_safetensors(Path(path), "streamfeat-classifier", FORMAT_VERSION)
+        labels, fingerprint = header.get("labels"), header.get("fingerprint")
+        provenance = header.get("provenance", {})
+        sound = isinstance(labels, list) and len(labels) >= 2 and all(isinstance(n, str) for n in labels)
+        if not (sound and isinstance(fingerprint, str) and isinstance(provenance, dict)):
+            raise InputError(f"{path}: labels, fingerprint or provenance are missing; train it again")
+        columns = 1 if len(labels) == 2 else len(labels)
+        n = arrays["centre"].size if "centre" in arrays else 0
+        shapes = {"centre": (n,), "scale": (n,), "weights": (n, columns), "bias": (columns,)}
+        for name, shape in shapes.items():
+            array = arrays.get(name)
+            if array is None or array.dtype != np.float32 or array.shape != shape:
+                raise InputError(f"{path}: {name} is not float32 of shape {shape}; train it again")
+            if not np.isfinite(array).all():
+                raise InputError(f"{path}: {name} is not finite; train it again")
+        if n == 0 or not (arrays["scale"] > 0).all():
+            raise InputError(f"{path}: scale must be above zero; train it again")
+        return cls(
+            labels=tuple(labels),
+            **{name: arrays[name] for name in shapes},
+            fingerprint=fingerprint,
+            provenance=provenance,
+        )
+
+
+def train_classifier(
+    features: NDArray[np.float32],
+    labels: Sequence[str],
+    encoder: Encoder,
+    *,
+    candidates: Sequence[float] = (1e-4, 1e-3, 1e-2, 1e-1, 1.0),
+    folds: int = 3,
+    seed: int = 0,
+    provenance: Mapping[str, Any] | None = None,
+) -> Classifier:
+    """Train a linear SVM; its regularisation is chosen by stratified cross-validation.
+
+    Args:
+        features: `(n, F)` float32, as `Encoder.encode` gives them.
+        labels: `n` names.
+        encoder: that made the features.
+        candidates: values of C to choose from; the scale is that of standardised features.
+        folds: of the cross-validation.
+        seed: of the folds.
+        provenance: JSON values kept with the classifier; scores are added.
+
+    Raises:
+        InputError: fewer than two classes, or a class with fewer samples than folds.
+    """
+    names, counts = np.unique(np.asarray(labels), return_counts=True)
+    if len(names) < 2:
+        raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")
+    if counts.min() < folds:
+        raise InputError(
+            f"label {names[counts.argmin()]!r} has {counts.min()} training samples, "
+            f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
+        )
+    pipeline = make_pipeline(FunctionTransformer(normalise_features), StandardScaler(), LinearSVM())
+    search = GridSearchCV(
+        pipeline,
+        {"linearsvm__C": list(candidates)},
+        cv=StratifiedKFold(folds, shuffle=True, random_state=seed),
+    )
+    search.fit(features, np.asarray(labels))
+    scaler, svm = search.best_estimator_[1], search.best_estimator_[2]
+    return Classifier(
+        labels=tuple(str(name) for name in svm.classes_),
+        centre=scaler.mean_.astype(np.float32),
+        scale=scaler.scale_.astype(np.float32),
+        weights=svm.coef_.T.astype(np.float32),
+        bias=svm.intercept_.astype(np.float32),
+        fingerprint=encoder.fingerprint,
+        provenance={
+            **(provenance or {}),
+            "C": float(search.best_params_["linearsvm__C"]),
+            "cross_validation": {
+                str(c): round(float(score), 4)
+                for c, score in zip(candidates, search.cv_results_["mean_test_score"], strict=True)
+            },
+            "samples": len(labels),
+        },
+    )
+
+
+class OnlineClassifier:
+    """A linear classifier that goes on learning: passive-aggressive steps over scikit-learn's `partial_fit`.
+
+    One step for one sample costs milliseconds in scikit-learn, a batch hardly more: samples are collected
+    and learned `batch_size` at a time. Predictions come from the weights of the last batch.
+
+    Args:
+        start: where to begin; its normalisation stays as it is.
+        rate: largest step for one sample (PA-I's C, Crammer et al. 2006).
+        batch_size: samples to collect before a step.
+        seed: of scikit-learn's shuffling.
+    """
+
+    def __init__(self, start: Classifier, *, rate: float = 0.01, batch_size: int = 16, seed: int = 0) -> None:
+        """Start from the weights of `start`."""
+        self.classifier = start
+        self.batch_size = batch_size
+        self.learned = 0
+        self._pending: list[tuple[NDArray[np.float32], int]] = []
+        self._model = SGDClassifier(
+            loss="hinge", penalty=None, learning_rate="pa1", eta0=rate, random_state=seed
+        )
+        # The first call only makes scikit-learn allocate; its weights are replaced at once.
+        classes = np.arange(len(start.labels))
+        self._model.partial_fit(np.zeros((len(classes), len(start.centre))), classes, classes=classes)
+        self._model.coef_ = start.weights.T.astype(np.float64)
+        self._model.intercept_ = start.bias.astype(np.float64)
+
+    def predict_one(self, features: NDArray[np.float32]) -> str:
+        """The label for features `(F,)`, before anything is learned from them."""
+        return self.classifier.predict(features)
+
+    def learn_one(self, features: NDArray[np.float32], label: str) -> None:
+        """Take in one labelled sample.
+
+        Args:
+            features: `(F,)` float32; copied.
+            label: one of `classifier.labels`.
+
+        Raises:
+            InputError: the label is unknown.
+        """
+        if label not in self.classifier.labels:
+            known = ", ".join(self.classifier.labels)
+            raise InputError(f"label {label!r} is not one of the classifier's labels: {known}")
+        self._pending.append((self.classifier.prepare(features), self.classifier.labels.index(label)))
+        if len(self._pending) >= self.batch_size:
+            self.flush()
+
+    def flush(self) -> None:
+        """Learn what has been collected."""
+        if not self._pending:
+            return
+        rows, targets = zip(*self._pending, strict=True)
+        self._pending.clear()
+        self._model.partial_fit(np.stack(rows), np.array(targets))
+        self.learned += len(targets)
+        old = self.classifier
+        self.classifier = Classifier(
+            labels=old.labels,
+            centre=old.centre,
+            scale=old.scale,
+            weights=self._model.coef_.T.astype(np.float32),
+            bias=self._model.intercept_.astype(np.float32),
+            fingerprint=old.fingerprint,
+            provenance={**old.provenance, "learned_online": self.learned},
+        )
+
+
+def _spread(scores: ArrayLike) -> NDArray[np.float32]:
+    """One score for each label: the single score of two classes counts for the one, against the other."""
+    values = np.asarray(scores, np.float32)
+    return np.concatenate([-values, values], axis=-1) if values.shape[-1] == 1 else values

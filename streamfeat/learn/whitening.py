@@ -1,0 +1,71 @@
+"""Normalising and whitening local volumes.
+
+Lives here: `VolumeWhitener`, a scikit-learn transformer. Not here: which volumes (`volumes`).
+"""
+
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+__all__ = ["VolumeWhitener"]
+
+
+class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Mean and contrast of each volume removed, then ZCA over all of them.
+
+    `v_hat = (v - mean(v)) / sqrt(var(v) + eps)`, `x = W (v_hat - mu)`,
+    `W = U (Lambda + eps_zca)^(-1/2) U'` from the covariance `U Lambda U'` of `v_hat`
+    (Coates, Ng and Lee 2011, section 3.1).
+
+    Args:
+        eps: added to the variance of each volume.
+        eps_zca: added to every eigenvalue; large values whiten less.
+        chunk_size: volumes held as floats at a time.
+
+    Attributes:
+        mean_: `(d,)` float32, `mu`.
+        whitening_: `(d, d)` float32, `W`, symmetric.
+    """
+
+    def __init__(self, eps: float = 0.01, eps_zca: float = 0.1, chunk_size: int = 8192) -> None:
+        """Keep the parameters."""
+        self.eps = eps
+        self.eps_zca = eps_zca
+        self.chunk_size = chunk_size
+
+    def fit(self, X: ArrayLike, y: Any = None) -> Self:
+        """Learn mean and whitening from `(n, d)` volumes in one pass; sums are float64."""
+        volumes = validate_data(self, X, ensure_min_samples=2)
+        n, d = volumes.shape
+        total, products = np.zeros(d), np.zeros((d, d))
+        for start in range(0, n, self.chunk_size):
+            normal = self._normalise(volumes[start : start + self.chunk_size])
+            total += normal.sum(axis=0, dtype=np.float64)
+            products += normal.T @ normal
+        mean = total / n
+        values, vectors = eigh(products / n - np.outer(mean, mean))
+        scaled = vectors / np.sqrt(values.clip(min=0.0) + self.eps_zca)
+        whitening = scaled @ vectors.T
+        self.mean_ = mean.astype(np.float32)
+        self.whitening_ = ((whitening + whitening.T) / 2).astype(np.float32)
+        return self
+
+    def transform(self, X: ArrayLike) -> NDArray[np.float32]:
+        """Whiten `(n, d)` volumes; float32."""
+        check_is_fitted(self)
+        volumes = validate_data(self, X, reset=False)
+        white = np.empty(volumes.shape, np.float32)
+        for start in range(0, len(volumes), self.chunk_size):
+            stop = start + self.chunk_size
+            white[start:stop] = (self._normalise(volumes[start:stop]) - self.mean_) @ self.whitening_
+        return white
+
+    def _normalise(self, volumes: NDArray[Any]) -> NDArray[np.float32]:
+        values = volumes.astype(np.float32)
+        values -= values.mean(axis=1, keepdims=True)
+        values /= np.sqrt(np.square(values).mean(axis=1, keepdims=True) + np.float32(self.eps))
+        return values
