@@ -93,7 +93,7 @@ class LibcaerCmpDecoder:
 
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
-        words = _records(payload, np.dtype("<u2"), "libcaer_cmp")
+        words = _words(payload, "libcaer_cmp")
         out = _room_for(words, _LIBCAER_CMP_YIELD, "libcaer_cmp")
         n = decode_libcaer_cmp(words, time_base_ns // 1000, self._state, out)
         if n < 0:
@@ -118,7 +118,7 @@ class Evt3Decoder:
 
     def decode(self, payload: bytes | memoryview, time_base_ns: int = 0) -> Events:
         """See `Decoder.decode`."""
-        words = _records(payload, np.dtype("<u2"), "evt3")
+        words = _words(payload, "evt3")
         out = _room_for(words, _EVT3_YIELD, "evt3")
         return out[: decode_evt3(words, self._state, out)]
 
@@ -205,6 +205,11 @@ def _records(payload: bytes | memoryview, dtype: np.dtype[_Record], encoding: st
     return records
 
 
+def _words(payload: bytes | memoryview, encoding: str) -> _Words:
+    """Copy a payload out, so that a kernel meets one array type, whatever address the bytes had."""
+    return _records(payload, np.dtype(np.uint16), encoding).copy()
+
+
 def _room_for(words: _Words, events_per_word: NDArray[np.uint8], encoding: str) -> Events:
     """Allocate for all events that these words can hold."""
     n = int(events_per_word[words].sum(dtype=np.int64))
@@ -273,7 +278,8 @@ def _libcaer_cmp_words(events: Events, offset_us: NDArray[np.int64]) -> _Words:
     y = events["y"] | events["p"].astype(np.uint16) << 11
     words = np.stack([high, 0x1000 | low, 0x2000 | x, 0x3000 | y], axis=1).astype("<u2")
     keep = np.stack([_changed(high, 0), _changed(low, 0), _changed(x, -1), np.ones(len(x), bool)], axis=1)
-    return words[keep]
+    kept: _Words = words[keep]
+    return kept
 
 
 def _encode_evt3(events: Events, after_us: int) -> bytes:
@@ -298,7 +304,7 @@ def _encode_evt3(events: Events, after_us: int) -> bytes:
 
 def _evt3_bridge(start: int, stop: int) -> _Words:
     """TIME_HIGH words from `start` towards `stop` in steps that count every wrap."""
-    bridge = np.arange(start, stop, _EVT3_MAX_STEP)
+    bridge: NDArray[np.int64] = np.arange(start, stop, _EVT3_MAX_STEP)
     if len(bridge) > _EVT3_MAX_BRIDGE:
         raise InputError(
             f"evt3 has 24-bit time and cannot jump from {start << 12} to {stop << 12} us; "

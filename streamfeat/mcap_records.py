@@ -31,7 +31,7 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 1 << 28
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
-_SCAN_BYTES = 1 << 20
+_SCAN_BYTES = 1 << 16
 
 # A chunk's header is recognised by its compression name; its two lengths must then agree.
 _CHUNK_HEAD = re.compile(rb"\x06(?=.{36}(?:\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd))", re.DOTALL)
@@ -114,7 +114,7 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
 def read_summary(file: BinaryIO) -> Summary | None:
     """Read the summary section, or give None when it is absent, damaged or not what its CRC says."""
     size = file.seek(0, os.SEEK_END)
-    footer_at = size - _FOOTER.size - _FRAME.size - len(MAGIC) + 9
+    footer_at = size - _FOOTER.size - len(MAGIC)
     if footer_at < len(MAGIC):
         return None
     file.seek(footer_at)
@@ -215,14 +215,14 @@ def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:
     for window in range(start, size, _SCAN_BYTES):
         file.seek(window)
         block = file.read(_SCAN_BYTES + _CHUNK_HEAD_BYTES + 4)
-        for match in _CHUNK_HEAD.finditer(block, 0):
-            head = block[match.start() :]
-            (length,) = struct.unpack_from("<Q", head, 1)
-            (name_length,) = struct.unpack_from("<I", head, 37)
-            if len(head) < 49 + name_length:
+        for match in _CHUNK_HEAD.finditer(block):
+            head = match.start()
+            (length,) = struct.unpack_from("<Q", block, head + 1)
+            (name_length,) = struct.unpack_from("<I", block, head + 37)
+            if head + 49 + name_length > len(block):
                 continue
-            (data_length,) = struct.unpack_from("<Q", head, 41 + name_length)
-            at = window + match.start()
+            (data_length,) = struct.unpack_from("<Q", block, head + 41 + name_length)
+            at = window + head
             if length == 40 + name_length + data_length and at + _FRAME.size + length <= size:
                 return at
     return None

@@ -89,7 +89,7 @@ class RecordingWriter:
                 f"`streamfeat recover`, or delete it"
             ) from None
         except OSError as error:
-            raise InputError(f"{self._part}: cannot be written: {error.strerror}") from None
+            raise self._unwritable(error) from None
         self._writer = Writer(self._file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
         self._writer.start(profile="ros2", library="streamfeat")
 
@@ -118,10 +118,13 @@ class RecordingWriter:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.close()
             self._check_target()
+            self._part.replace(self.path)
+        except OSError as error:
+            self._abandon()
+            raise self._unwritable(error) from None
         except BaseException:
             self._abandon()
             raise
-        self._part.replace(self.path)
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system, so that a crash cannot take it."""
@@ -214,7 +217,13 @@ class RecordingWriter:
         if topic not in self._channels:
             schema = self._writer.register_schema(message.SCHEMA_NAME, "ros2msg", message.SCHEMA.encode())
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        self._writer.add_message(self._channels[topic], message.stamp_ns, data, message.stamp_ns)
+        try:
+            self._writer.add_message(self._channels[topic], message.stamp_ns, data, message.stamp_ns)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> InputError:
+        return InputError(f"{self._part}: cannot be written: {error.strerror}; is there room and permission?")
 
     def _check_target(self) -> None:
         if self.path.exists() and not self._overwrite:

@@ -65,11 +65,31 @@ class Label:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """A label, its events in stored order, and the resolution of the packets they came in."""
+    """A label, its events in stored order, and the resolution of the packet that brought the first."""
 
     label: Label
     events: Events
     resolution: Resolution
+
+
+@dataclass(slots=True)
+class _PendingSample:
+    """A sample whose end has not been reached."""
+
+    label: Label
+    parts: list[Events] = field(default_factory=list)
+    resolution: Resolution | None = None
+
+    def add(self, packet: Packet) -> None:
+        t = packet.events["t"]
+        inside = packet.events[(t >= self.label.start_us) & (t < _end_us(self.label))]
+        if len(inside):
+            self.parts.append(inside)
+            self.resolution = self.resolution or packet.resolution
+
+    def finish(self, default: Resolution) -> Sample:
+        events = np.concatenate([np.zeros(0, EVENT_DTYPE), *self.parts])
+        return Sample(self.label, events, self.resolution or default)
 
 
 @dataclass(slots=True)
@@ -110,7 +130,8 @@ def open_recording(path: str | PathLike[str], topic: str | None = None) -> "Reco
 class Recording:
     """A recording of events, read in file order; iterate as often as you like.
 
-    `losses` tells what the latest pass (iteration, or one of the counts) could not read.
+    `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass
+    (an iteration, or the first use of a count) could not read.
     """
 
     path: Path
@@ -133,9 +154,9 @@ class Recording:
             self.topic = _choose_topic(
                 self.path, [t for t in self.topics if t.schema in _EVENT_SCHEMAS], topic
             )
-            self.losses = Losses()
             self.encoding = ""
             self.resolution = self._first_packet().resolution
+            self.losses = Losses()
         except BaseException:
             self._file.close()
             raise
@@ -197,18 +218,18 @@ class Recording:
 
         A sample is complete when a packet starts, or a label begins, at or after its end.
         """
-        open_samples: list[tuple[Label, list[Packet]]] = []
+        pending: list[_PendingSample] = []
         for item in self.items():
             now = item.start_us if isinstance(item, Label) else _start_us(item)
-            while now is not None and open_samples and now >= _end_us(open_samples[0][0]):
-                yield self._sample(*open_samples.pop(0))
+            while now is not None and pending and now >= _end_us(pending[0].label):
+                yield pending.pop(0).finish(self.resolution)
             if isinstance(item, Label):
-                open_samples.append((item, []))
+                pending.append(_PendingSample(item))
             else:
-                for _, packets in open_samples:
-                    packets.append(item)
-        for label, packets in open_samples:
-            yield self._sample(label, packets)
+                for sample in pending:
+                    sample.add(item)
+        for sample in pending:
+            yield sample.finish(self.resolution)
 
     @cached_property
     def _totals(self) -> _Totals:
@@ -284,13 +305,13 @@ class Recording:
             decoders[packet.encoding] = make_decoder(packet.encoding)
         events = decoders[packet.encoding].decode(packet.events, packet.time_base)
         resolution = _resolution(packet.height, packet.width)
-        self.encoding = packet.encoding
+        self.encoding = self.encoding or packet.encoding
         return Packet(self.topic, events, resolution, message.log_time, packet.seq)
 
     def _read_array(self, message: Message) -> Packet:
         array = EventArray.from_cdr(message.data)
         resolution = _resolution(array.height, array.width)
-        self.encoding = "dvs_msgs"
+        self.encoding = self.encoding or "dvs_msgs"
         return Packet(self.topic, array.events, resolution, message.log_time, message.sequence)
 
     def _count_missing(self, channel_id: int, seen: int, losses: Losses) -> None:
@@ -301,11 +322,6 @@ class Recording:
         schema = self._known.schemas.get(channel.schema_id)
         if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
             losses.add("missing message", 0, f"topic {channel.topic}: {missing} not found", missing)
-
-    def _sample(self, label: Label, packets: list[Packet]) -> Sample:
-        events = np.concatenate([p.events for p in packets] or [np.zeros(0, EVENT_DTYPE)])
-        inside = (events["t"] >= label.start_us) & (events["t"] < _end_us(label))
-        return Sample(label, events[inside], packets[0].resolution if packets else self.resolution)
 
 
 def _open_mcap(path: Path) -> BinaryIO:
