@@ -197,7 +197,7 @@ def simulate_saccades(
         saccades: motion; None is `Saccades()`.
 
     Returns:
-        `(n,)` array of `EVENT_DTYPE` sorted by `t`, which runs from 0 to 300,000 microseconds by default.
+        `(n,)` array of `EVENT_DTYPE` sorted by `t`, with `0 <= t < 300_000` microseconds by default.
 
     Raises:
         ValueError: `image` is not two-dimensional, or has values outside 0 to 1.
@@ -230,7 +230,7 @@ def events_from_frames(
         camera: sensor of the same resolution.
 
     Returns:
-        `(n,)` array of `EVENT_DTYPE` sorted by `t`, with `times_us[0] <= t <= times_us[-1]`.
+        `(n,)` array of `EVENT_DTYPE` sorted by `t`, with `times_us[0] <= t < times_us[-1]`.
 
     Raises:
         ValueError: the frames do not fit the camera or the times.
@@ -249,6 +249,7 @@ def events_from_frames(
     t = np.append(t, noise_t)
     is_noise = np.arange(len(t)) >= len(t) - len(noise_t)
     kept = _outside_refractory(pixel, t, is_noise, camera.refractory_us)
+    kept = kept[t[kept] < times_us[-1]]
     kept = kept[np.lexsort((pixel[kept], t[kept]))]
     width = camera.resolution[1]
     return make_events(pixel[kept] % width, pixel[kept] // width, polarity[kept], t[kept])
