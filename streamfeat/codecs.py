@@ -145,7 +145,7 @@ def make_decoder(encoding: str) -> Decoder:
         InputError: the encoding is none of `ENCODINGS`.
     """
     if encoding not in _DECODERS:
-        raise InputError(f"unknown event encoding {encoding!r}; known are {', '.join(ENCODINGS)}")
+        raise InputError(f"unknown event encoding {encoding[:40]!r}; known are {', '.join(ENCODINGS)}")
     return _DECODERS[encoding]()
 
 

@@ -206,7 +206,7 @@ class Recording:
                     last_seq = packet.seq
                     item = self._read_packet(packet, message, decoders)
             except InputError as error:
-                where = f"topic {channel.topic}, message {seen[channel.id]} (byte {at}): {error}"
+                where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
                 losses.add("bad label" if is_label else "bad packet", len(message.data), where)
             else:
                 yield item
@@ -296,7 +296,7 @@ class Recording:
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
-        raise InputError(f"{self.path}: nothing can be read from topic {self.topic}: {reasons[0]}")
+        raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
 
     def _read_packet(self, packet: EventPacket, message: Message, decoders: dict[str, Decoder]) -> Packet:
         if packet.is_bigendian:
@@ -321,7 +321,7 @@ class Recording:
             return
         schema = self._known.schemas.get(channel.schema_id)
         if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
-            losses.add("missing message", 0, f"topic {channel.topic}: {missing} not found", missing)
+            losses.add("missing message", 0, f"topic {channel.topic!r}: {missing} not found", missing)
 
 
 def _open_mcap(path: Path) -> BinaryIO:
@@ -366,9 +366,9 @@ def _choose_topic(path: Path, topics: list[Topic], wanted: str | None) -> str:
     if not names:
         raise InputError(f"{path}: no topic carries {' or '.join(_EVENT_SCHEMAS)}; is this the right file?")
     if wanted is None and len(names) > 1:
-        raise InputError(f"{path}: several topics carry events, choose one of {', '.join(names)}")
+        raise InputError(f"{path}: several topics carry events, choose one of {names}")
     if wanted is not None and wanted not in names:
-        raise InputError(f"{path}: no events on topic {wanted}; topics with events: {', '.join(names)}")
+        raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
     return wanted or names[0]
 
 
