@@ -1,0 +1,295 @@
+"""Folders of foreign event files -> labelled samples -> one recording.
+
+Lives here: the folder layouts of data sets, where samples stand in time, and the conversion to MCAP.
+Not here: the formats of single files (`streamfeat.camera_files`) and MCAP itself (`streamfeat.recorder`).
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from streamfeat.camera_files import EXTENSIONS, open_events
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+from streamfeat.recorder import RecordingWriter
+from streamfeat.recording import Label
+
+__all__ = ["Conversion", "SamplePath", "convert", "find_samples"]
+
+_SPLITS = {
+    "train": "train",
+    "training": "train",
+    "test": "test",
+    "testing": "test",
+    "val": "validation",
+    "valid": "validation",
+    "validation": "validation",
+}
+_LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
+_HELD_IN_MEMORY = 32 << 20  # bytes of a file; larger ones are read twice instead
+
+
+@dataclass(frozen=True, slots=True)
+class SamplePath:
+    """One sample: its file, class, split ("" where no folder names one) and relative path."""
+
+    path: Path
+    label: str
+    split: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """What became of a source: counts of what was written, and a line for each file with a fault.
+
+    `failed` files are not in the recording; of `damaged` files, all that could be read is.
+    `bytes_in` counts the files that were converted, `bytes_out` the recording.
+    """
+
+    samples: int
+    events: int
+    failed: list[tuple[Path, str]]
+    damaged: list[tuple[Path, str]]
+    bytes_in: int
+    bytes_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class _DataSet:
+    """What the documentation of a data set says and its files do not."""
+
+    duration_us: int
+    """Nominal length of a sample."""
+    resolution: Resolution | None
+    """`(height, width)` of every sample, None where each has its own."""
+
+
+# In these the clock of a file starts with the sample. N-CARS: Sironi et al. (2018), crops of 100 ms, first
+# event always at 0. N-MNIST and N-Caltech101: Orchard et al. (2015), three saccades of 100 ms, first event up
+# to 7 ms after the start; some files run on to 316 ms.
+_NCARS = _DataSet(100_000, None)
+_NMNIST = _DataSet(300_000, (34, 34))
+_NCALTECH101 = _DataSet(300_000, None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """One file after a first look: its batches (in memory, or read again) and what all of them show."""
+
+    batches: Iterable[Events]
+    resolution: Resolution
+    n: int
+    first_us: int
+    last_us: int
+
+
+def find_samples(folder: str | Path) -> list[SamplePath]:
+    """Find the labelled samples of a data set folder.
+
+    A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
+    the label whose name ends in train, test, validation or a usual variant (`Train`, `n-cars_test`) gives the
+    split; `folder` itself counts. Hidden files, folders of annotations, and files without a label are passed
+    over.
+
+    Returns:
+        Samples sorted by `source`, their path relative to `folder` with forward slashes.
+
+    Raises:
+        InputError: there is no such folder, or no sample in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder")
+    samples = []
+    for path in folder.rglob("*"):
+        *above, _ = parts = path.relative_to(folder).parts
+        hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
+        if hidden or path.suffix.lower() not in EXTENSIONS or not above or not path.is_file():
+            continue
+        if len(above) == 1 and _split_of(above[0]):
+            continue  # a file right inside a split has no label
+        split = next(filter(None, map(_split_of, [*above[-2::-1], folder.resolve().name])), "")
+        samples.append(SamplePath(path, above[-1], split, "/".join(parts)))
+    if not samples:
+        raise InputError(
+            f"{folder}: holds no samples; expected LABEL/FILE or SPLIT/LABEL/FILE with files ending in "
+            f"{' '.join(sorted(EXTENSIONS))}"
+        )
+    return sorted(samples, key=lambda sample: sample.source)
+
+
+def convert(
+    source: str | Path,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    gap_us: int = 1_000_000,
+    split: str | None = None,
+    split_every: int | None = None,
+    encoding: str = "mono",
+    compression: Literal["zstd", "lz4", "none"] = "zstd",
+    limit: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Conversion:
+    """Convert a data set folder, or one event file, to a recording.
+
+    Samples of a folder follow each other in order of their relative paths, each announced by its label, with
+    silence of `gap_us` before each and between one's nominal end and the next. In N-CARS, N-MNIST and
+    N-Caltech101 the start of a sample is time 0 of its file; elsewhere it is the first event. A label lasts
+    the nominal duration of its data set, or to its last event where that is later or nothing is nominal.
+    A single file keeps its times and has no label.
+
+    Args:
+        source: the folder or file.
+        out: the recording to write. It appears only when all is written.
+        overwrite: replace `out` where it exists.
+        gap_us: silence between samples in microseconds, positive; at least one window of the encoder to be.
+        split: name for the split of all samples, instead of what their folders say.
+        split_every: every such sample (5: index 4, 9, ...) is split "validation" and the others "train".
+            Samples in test folders stay "test" and are not counted.
+        encoding: of the packets, see `streamfeat.codecs.ENCODINGS`.
+        compression: of the chunks, see `RecordingWriter`.
+        limit: convert only so many samples, as many of each label as the others have.
+        progress: called with samples done and samples in all, after each.
+
+    Raises:
+        InputError: `source` cannot be read at all, `out` cannot be written, or an argument is out of range.
+    """
+    source, out = Path(source), Path(out)
+    if gap_us <= 0 or (limit is not None and limit <= 0) or (split_every is not None and split_every < 2):
+        raise InputError("gap_us and limit must be positive, split_every at least 2")
+    if split is not None and split_every is not None:
+        raise InputError("split and split_every exclude each other; give one")
+    if not source.is_dir():
+        with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
+            n, damage = _write_file(source, writer)
+        if progress:
+            progress(1, 1)
+        damaged = [(source, damage)] if damage else []
+        return Conversion(0, n, [], damaged, source.stat().st_size, out.stat().st_size)
+    samples = find_samples(source)
+    data_set = _recognise(samples)
+    if split_every is not None:
+        samples = _hold_out(samples, split_every)
+    elif split is not None:
+        samples = [replace(sample, split=split) for sample in samples]
+    if limit is not None:
+        samples = _spread(samples, limit)
+    with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
+        done = _write_samples(samples, data_set, gap_us, writer, progress)
+    return replace(done, bytes_out=out.stat().st_size)
+
+
+def _write_file(path: Path, writer: RecordingWriter) -> tuple[int, str]:
+    """Write one file as it is; return its number of events and its damage."""
+    file, damage = _measure(path, None)
+    _write_events(path, file, 0, writer)
+    return file.n, damage
+
+
+def _write_events(path: Path, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
+    for batch in file.batches:
+        moved = batch.copy()
+        moved["t"] += shift_us
+        try:
+            writer.write_events(moved, file.resolution)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+
+def _write_samples(
+    samples: Sequence[SamplePath],
+    data_set: _DataSet | None,
+    gap_us: int,
+    writer: RecordingWriter,
+    progress: Callable[[int, int], None] | None,
+) -> Conversion:
+    failed, damaged = [], []
+    n_events, bytes_in, start_us = 0, 0, gap_us
+    for done, sample in enumerate(samples, 1):
+        try:
+            file, damage = _measure(sample.path, data_set)
+            origin_us = 0 if data_set else file.first_us
+            if file.last_us - origin_us >= _LONGEST_SAMPLE_US:
+                raise InputError(f"{sample.path}: lasts to {file.last_us} us, longer than an hour; damaged?")
+        except InputError as error:
+            failed.append((sample.path, str(error)))
+        else:
+            nominal_us = data_set.duration_us if data_set else 0
+            duration_us = max(nominal_us, file.last_us - origin_us + 1)
+            writer.write_label(Label(start_us, duration_us, sample.label, sample.split, sample.source))
+            _write_events(sample.path, file, start_us - origin_us, writer)
+            start_us += duration_us + gap_us
+            n_events += file.n
+            bytes_in += sample.path.stat().st_size
+            if damage:
+                damaged.append((sample.path, damage))
+        if progress:
+            progress(done, len(samples))
+    if len(failed) == len(samples):
+        raise InputError(f"none of the {len(samples)} samples can be read; the first: {failed[0][1]}")
+    return Conversion(len(samples) - len(failed), n_events, failed, damaged, bytes_in, 0)
+
+
+def _measure(path: Path, data_set: _DataSet | None) -> tuple[_Measured, str]:
+    """Read a file once, for its extent in space and time; hold its events only when it is small."""
+    file = open_events(path)
+    batches: Iterable[Events] = [*file] if path.stat().st_size <= _HELD_IN_MEMORY else file
+    resolution = data_set.resolution if data_set else None
+    n, height, width, first_us, last_us = 0, 1, 1, np.iinfo(np.int64).max, 0
+    for batch in batches:
+        if len(batch):
+            n += len(batch)
+            height, width = max(height, int(batch["y"].max()) + 1), max(width, int(batch["x"].max()) + 1)
+            first_us, last_us = min(first_us, int(batch["t"].min())), max(last_us, int(batch["t"].max()))
+    if n == 0:
+        raise InputError(f"{path}: holds no events")
+    resolution = resolution or file.resolution or (height, width)
+    if height > resolution[0] or width > resolution[1]:
+        raise InputError(
+            f"{path}: events cover {width}x{height} pixels, its data set {resolution[1]}x{resolution[0]}"
+        )
+    return _Measured(batches, resolution, n, first_us, last_us), "; ".join(file.damage)
+
+
+def _recognise(samples: Sequence[SamplePath]) -> _DataSet | None:
+    labels = {sample.label for sample in samples}
+    endings = {sample.path.suffix.lower() for sample in samples}
+    if endings == {".dat"} and labels <= {"cars", "background"}:
+        return _NCARS
+    if endings == {".bin"}:
+        return _NMNIST if labels <= set("0123456789") else _NCALTECH101
+    return None
+
+
+def _hold_out(samples: Sequence[SamplePath], every: int) -> list[SamplePath]:
+    """Mark every so-manieth sample that is not of a test folder as validation, and the others as train."""
+    marked, seen = [], 0
+    for sample in samples:
+        if sample.split != "test":
+            seen += 1
+            sample = replace(sample, split="train" if seen % every else "validation")
+        marked.append(sample)
+    return marked
+
+
+def _spread(samples: Sequence[SamplePath], limit: int) -> list[SamplePath]:
+    """Take the first of each split and label in turns, so that a few samples still hold all of them."""
+    groups = defaultdict(list)
+    for sample in samples:
+        groups[sample.split, sample.label].append(sample)
+    order = sorted((turn, i) for i, group in enumerate(groups.values()) for turn in range(len(group)))
+    listed = list(groups.values())
+    taken = [listed[i][turn] for turn, i in order[:limit]]
+    return sorted(taken, key=lambda sample: sample.source)
+
+
+def _split_of(name: str) -> str:
+    """The split that the last word of a folder's name stands for, or ""."""
+    return _SPLITS.get(re.split(r"[-_ ]", name.lower())[-1], "")
