@@ -15,7 +15,7 @@ from typing import Any
 
 from streamfeat.camera_words import Source, checked_resolution, declared_resolution
 from streamfeat.errors import InputError
-from streamfeat.event_tables import checked_events, named_columns
+from streamfeat.event_tables import checked_events, named_columns, one_line
 from streamfeat.events import Events, Resolution, make_events
 
 __all__ = ["aedat4_resolution", "hdf5_resolution", "read_aedat4", "read_hdf5"]
@@ -27,8 +27,12 @@ def aedat4_resolution(path: Path) -> Resolution:
     """`(height, width)` of the one event stream."""
     try:
         tracks = _library("faery", path).aedat.Decoder(path).tracks()
-    except RuntimeError as error:
-        raise InputError(f"{path}: AEDAT4 header or index is cut short or damaged: {error}") from error
+    except BaseException as error:
+        if not _is_damage(error):
+            raise
+        raise InputError(
+            f"{path}: AEDAT4 header or index is cut short or damaged: {one_line(error)}"
+        ) from error
     sizes = [track.dimensions for track in tracks if track.data_type == "events"]
     if len(sizes) != 1:
         raise InputError(f"{path}: has {len(sizes)} event streams; only files with one are read")
@@ -43,10 +47,20 @@ def read_aedat4(file: Source) -> Iterator[Events]:
             if track.data_type == "events":
                 n += len(packet)
                 yield make_events(packet["x"], packet["y"], packet["on"], packet["t"])
-    except RuntimeError as error:
+    except BaseException as error:
+        if not _is_damage(error):
+            raise
         if n == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {error}") from error
-        file.lose(0, f"everything after event {n} is lost: {error}")
+            raise InputError(f"{file.path}: damaged before the first event: {one_line(error)}") from error
+        file.lose(0, f"everything after event {n} is lost: {one_line(error)}")
+
+
+def _is_damage(error: BaseException) -> bool:
+    """Whether faery means the file: a RuntimeError, or a panic of its parser.
+
+    A panic is a `PanicException`, which is no `Exception` and belongs to no module that can be imported.
+    """
+    return isinstance(error, RuntimeError) or type(error).__name__ == "PanicException"
 
 
 def hdf5_resolution(path: Path) -> Resolution | None:
@@ -58,7 +72,7 @@ def hdf5_resolution(path: Path) -> Resolution | None:
     except InputError:
         raise
     except Exception as error:  # h5py passes on whatever the HDF5 library made of the damage
-        raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
+        raise InputError(f"{path}: HDF5 file is cut short or damaged: {one_line(error)}") from error
     text = geometry.decode("ascii", "replace") if isinstance(geometry, bytes) else str(geometry)
     return declared_resolution(path, {"geometry": text})
 
@@ -78,8 +92,8 @@ def read_hdf5(file: Source) -> Iterator[Events]:
         raise
     except Exception as error:  # as above
         if row == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {error}") from error
-        file.lose(0, f"everything after event {row} is lost: {error}")
+            raise InputError(f"{file.path}: damaged before the first event: {one_line(error)}") from error
+        file.lose(0, f"everything after event {row} is lost: {one_line(error)}")
 
 
 def _hdf5_dataset(path: Path, root: Any) -> Any:

@@ -31,7 +31,7 @@ _SPLITS = {
     "validation": "validation",
 }
 _LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
-_HELD_IN_MEMORY = 32 << 20  # bytes of a file; larger ones are read twice instead
+_HELD_IN_MEMORY = 8 << 20  # bytes of a file, at most 96 times that in events; larger files are read twice
 
 
 @dataclass(frozen=True, slots=True)

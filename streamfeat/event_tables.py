@@ -18,7 +18,15 @@ from streamfeat.camera_words import BLOCK_BYTES, Source, checked_resolution
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
 
-__all__ = ["HEAD_BYTES", "checked_events", "named_columns", "read_numpy", "read_text", "text_resolution"]
+__all__ = [
+    "HEAD_BYTES",
+    "checked_events",
+    "named_columns",
+    "one_line",
+    "read_numpy",
+    "read_text",
+    "text_resolution",
+]
 
 _ALIASES = {"x": ("x",), "y": ("y",), "p": ("p", "on", "polarity"), "t": ("t", "ts", "timestamp")}
 _LARGEST_UNPACKED = 2 << 30  # bytes of an .npz in memory at once
@@ -65,7 +73,9 @@ def read_numpy(file: Source) -> Iterator[Events]:
                     raise ValueError(f"{unpacked} bytes when unpacked, more than {_LARGEST_UNPACKED}")
                 columns = {name: loaded[name] for name in loaded.files}
     except Exception as error:  # zip, zlib and header parsers raise a dozen unrelated types on damage
-        raise InputError(f"{file.path}: not a readable NumPy file without pickles: {error}") from error
+        raise InputError(
+            f"{file.path}: not a readable NumPy file without pickles: {one_line(error)}"
+        ) from error
     if len(columns) == 1 and (fields := next(iter(columns.values())).dtype.names) is not None:
         (table,) = columns.values()
         columns = {name: table[name] for name in fields}
@@ -148,6 +158,11 @@ def text_resolution(path: Path, head: bytes) -> Resolution | None:
     return _text_layout(path, head).resolution
 
 
+def one_line(error: BaseException) -> str:
+    """What a library says, however many lines it takes, as part of a one-line message."""
+    return " ".join(str(error).split())[:200]
+
+
 def _is_comment(line: str) -> bool:
     return not line.strip() or line.lstrip()[0] in "#%"
 
@@ -159,7 +174,7 @@ def _text_events(path: Path, first_row: int, lines: list[str], layout: _TextLayo
         t, x, y, p = (table[:, column] for column in layout.order)
     except (ValueError, IndexError, UserWarning) as error:
         raise InputError(
-            f"{path}: after event {first_row}: {error}; expected lines of numbers 't x y p'"
+            f"{path}: after event {first_row}: {one_line(error)}; expected lines of numbers 't x y p'"
         ) from error
     return checked_events(
         path, first_row, {"x": x, "y": y, "p": p, "t": np.rint(t * 1e6) if layout.in_seconds else t}

@@ -164,6 +164,21 @@ class TestRecordings:
             with pytest.raises(InputError, match=r"a\.aedat4"):
                 read_events(file_of(tmp_path, "a.aedat4", data[:length]))
 
+    @pytest.mark.parametrize(
+        ("at", "damage"),
+        [
+            (-2000, bytes(range(250)) * 4),  # the index at the end, of which faery says several lines
+            (18, b"\xff\xff\xff\x7f"),  # the offset of the header, at which faery panics
+        ],
+    )
+    def test_damage_to_what_aedat4_starts_from_is_one_line(self, shared_data, tmp_path, at, damage):
+        pytest.importorskip("faery")
+        data = bytearray((shared_data / "samples/dvs_320x240.aedat4").read_bytes())
+        data[at : at + len(damage)] = damage
+        with pytest.raises(InputError, match="damaged") as caught:
+            read_events(file_of(tmp_path, "a.aedat4", bytes(data)))
+        assert "\n" not in str(caught.value)
+
     def test_ncaltech101(self, shared_data):
         read = read_events(shared_data / "samples/ncaltech101_faces_easy_0001.bin")
         assert (len(read.events), read.resolution) == (67_445, (173, 151))

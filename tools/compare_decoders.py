@@ -65,9 +65,8 @@ def main() -> None:
                 rates[library].append(len(results[library]) / (time.perf_counter() - start) / 1e6)
         for library, events in results.items():
             verdict = differences(events, reference)
-            print(
-                f"| {name} | {library} | {len(events)} | {statistics.median(rates[library]):.1f} | {verdict} |"
-            )
+            rate = statistics.median(rates[library])
+            print(f"| {name} | {library} | {len(events)} | {rate:.1f} | {verdict} |")
 
 
 def differences(events: Events, reference: Events) -> str:
