@@ -35,7 +35,7 @@ _SCAN_BYTES = 1 << 16
 
 # A chunk's header is recognised by its compression name; its two lengths must then agree.
 _CHUNK_HEAD = re.compile(rb"\x06(?=.{36}(?:\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd))", re.DOTALL)
-_CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 4 + 8
+_CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name of a compression
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
 
@@ -79,35 +79,39 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
     chunk and counted in `losses`, which is changed. Nothing is raised but `OSError`.
     """
     size = file.seek(0, os.SEEK_END)
-    at = len(MAGIC)
+    at = trusted = len(MAGIC)  # up to `trusted`, records start where we think they do
     while True:
         file.seek(at)
-        head = file.read(_FRAME.size)
+        head = file.read(_CHUNK_HEAD_BYTES)
         if len(head) < _FRAME.size:
             losses.add("truncated", len(head), f"byte {at}: the file ends without an end-of-data record")
             return
-        opcode, length = _FRAME.unpack(head)
+        opcode, length = _FRAME.unpack_from(head)
         end = at + _FRAME.size + length
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
-        if end > size or not (Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 0x80):
-            following = _find_chunk(file, at + 1, size)
+        if end > size or not _is_record(opcode, length, head):
+            # The record before may have had a wrong length, and chunks may lie inside of it.
+            following = _find_chunk(file, trusted + 1, size)
             reason = "truncated" if following is None and end > size else "damaged record"
-            losses.add(
-                reason,
-                (following or size) - at,
-                f"byte {at}: record type {opcode} with {length} bytes cannot be here",
-            )
+            where = f"byte {at}: record type {opcode} with {length} bytes cannot be here"
+            start = at if following is None or following > at else trusted
+            losses.add(reason, (following or size) - start, where)
             if following is None:
                 return
-            end = following
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
-            if length > MAX_RECORD_BYTES:
-                losses.add("oversized", length, f"byte {at}: a record of {length} bytes")
-            elif opcode == Opcode.CHUNK:
-                yield from _chunk_records(file.read(length), at, losses)
-            else:
-                yield from _one_record(opcode, file.read(length), at, losses)
+            at = trusted = following
+            continue
+        trusted = at
+        file.seek(at + _FRAME.size)
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+            pass
+        elif length > MAX_RECORD_BYTES:
+            losses.add("oversized", length, f"byte {at}: a record of {length} bytes")
+        elif opcode == Opcode.CHUNK:
+            yield from _chunk_records(file.read(length), at, losses)
+            trusted = end
+        else:
+            yield from _one_record(opcode, file.read(length), at, losses)
         at = end
 
 
@@ -214,15 +218,29 @@ def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:
     """Find the next byte where a whole chunk starts."""
     for window in range(start, size, _SCAN_BYTES):
         file.seek(window)
-        block = file.read(_SCAN_BYTES + _CHUNK_HEAD_BYTES + 4)
+        block = file.read(_SCAN_BYTES + _CHUNK_HEAD_BYTES)
         for match in _CHUNK_HEAD.finditer(block):
-            head = match.start()
-            (length,) = struct.unpack_from("<Q", block, head + 1)
-            (name_length,) = struct.unpack_from("<I", block, head + 37)
-            if head + 49 + name_length > len(block):
-                continue
-            (data_length,) = struct.unpack_from("<Q", block, head + 41 + name_length)
-            at = window + head
-            if length == 40 + name_length + data_length and at + _FRAME.size + length <= size:
+            at = window + match.start()
+            length = _chunk_length(block, match.start())
+            if length is not None and at + _FRAME.size + length <= size:
                 return at
     return None
+
+
+def _is_record(opcode: int, length: int, head: bytes) -> bool:
+    """Whether a record may start with these bytes; types above 0x80 are private to whoever wrote them."""
+    if opcode == Opcode.CHUNK:
+        return _chunk_length(head, 0) == length
+    return Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 0x80
+
+
+def _chunk_length(block: bytes, at: int) -> int | None:
+    """Length of the chunk whose header is at this place of a block, when both its lengths agree."""
+    if at + 41 > len(block):
+        return None
+    (length,) = struct.unpack_from("<Q", block, at + 1)
+    (name_length,) = struct.unpack_from("<I", block, at + 37)
+    if at + 49 + name_length > len(block):
+        return None
+    (data_length,) = struct.unpack_from("<Q", block, at + 41 + name_length)
+    return int(length) if length == 40 + name_length + data_length else None
