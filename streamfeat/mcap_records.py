@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
+from pathlib import Path
 from typing import BinaryIO
 
 import lz4.frame
@@ -25,9 +26,19 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
-__all__ = ["MAGIC", "MAX_RECORD_BYTES", "Losses", "Summary", "iter_records", "read_summary"]
+from streamfeat.errors import InputError
 
-MAGIC = b"\x89MCAP0\r\n"
+__all__ = [
+    "MAX_RECORD_BYTES",
+    "Losses",
+    "Summary",
+    "iter_messages",
+    "iter_records",
+    "open_mcap",
+    "read_summary",
+]
+
+_MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 1 << 28
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
@@ -38,6 +49,8 @@ _CHUNK_HEAD = re.compile(rb"\x06(?=.{36}(?:\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd
 _CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name of a compression
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
+
+_NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 Record = Schema | Channel | Message
 
@@ -72,6 +85,51 @@ class Summary:
     """Messages of each channel id."""
 
 
+def open_mcap(path: Path) -> BinaryIO:
+    """Open a file that begins like an MCAP file.
+
+    Raises:
+        InputError: it is missing, empty, or begins otherwise.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    magic = file.read(len(_MAGIC))
+    if magic != _MAGIC:
+        file.close()
+        what = "is empty" if not magic else "is not an MCAP recording"
+        raise InputError(f"{path}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
+    return file
+
+
+def iter_messages(
+    file: BinaryIO, known: Summary | None, losses: Losses
+) -> Iterator[tuple[int, Channel, Schema, Message]]:
+    """Yield messages in file order, each with its byte (see `iter_records`), channel and schema.
+
+    Args:
+        file: opened by `open_mcap`.
+        known: what the summary said; its channels stand in for those lost in a damaged chunk.
+        losses: changed.
+    """
+    schemas = {0: _NO_SCHEMA} | (known.schemas if known else {})
+    channels = dict(known.channels if known else {})
+    for at, record in iter_records(file, losses):
+        if isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+        else:
+            channel = channels.get(record.channel_id)
+            schema = schemas.get(channel.schema_id) if channel else None
+            if channel is None or schema is None:
+                where = f"byte {at}: nothing tells what channel {record.channel_id} is"
+                losses.add("unknown channel", len(record.data), where)
+            else:
+                yield at, channel, schema, record
+
+
 def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]:
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
@@ -79,7 +137,7 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
     chunk and counted in `losses`, which is changed. Nothing is raised but `OSError`.
     """
     size = file.seek(0, os.SEEK_END)
-    at = trusted = len(MAGIC)  # up to `trusted`, records start where we think they do
+    at = trusted = len(_MAGIC)  # up to `trusted`, records start where we think they do
     while True:
         file.seek(at)
         head = file.read(_CHUNK_HEAD_BYTES)
@@ -118,15 +176,15 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
 def read_summary(file: BinaryIO) -> Summary | None:
     """Read the summary section, or give None when it is absent, damaged or not what its CRC says."""
     size = file.seek(0, os.SEEK_END)
-    footer_at = size - _FOOTER.size - len(MAGIC)
-    if footer_at < len(MAGIC):
+    footer_at = size - _FOOTER.size - len(_MAGIC)
+    if footer_at < len(_MAGIC):
         return None
     file.seek(footer_at)
     footer = file.read(_FOOTER.size)
     opcode, length, start, _, crc = _FOOTER.unpack(footer)
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - _FRAME.size or file.read(len(MAGIC)) != MAGIC:
+    if opcode != Opcode.FOOTER or length != _FOOTER.size - _FRAME.size or file.read(len(_MAGIC)) != _MAGIC:
         return None
-    if not len(MAGIC) <= start < footer_at or footer_at - start > MAX_RECORD_BYTES:
+    if not len(_MAGIC) <= start < footer_at or footer_at - start > MAX_RECORD_BYTES:
         return None
     file.seek(start)
     section = file.read(footer_at - start)

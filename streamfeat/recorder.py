@@ -1,6 +1,7 @@
 """Writing recordings: events, labels, features and predictions into an MCAP file.
 
-Lives here: `RecordingWriter`; cutting batches into packets, and never leaving half a file in place.
+Lives here: `RecordingWriter`; cutting batches into packets, and never leaving half a file in place; and
+`recover`, which copies what can be read of a damaged file.
 Not here: reading (`streamfeat.recording`), what bytes a message has (`streamfeat.messages`).
 """
 
@@ -11,16 +12,18 @@ from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
+from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
 from streamfeat.codecs import encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
+from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
 from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.recording import Label
 
-__all__ = ["RecordingWriter"]
+__all__ = ["RecordingWriter", "recover"]
 
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
@@ -34,10 +37,33 @@ _COMPRESSION = {
 _Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
 
 
+def recover(source: str | PathLike[str], target: str | PathLike[str], *, overwrite: bool = False) -> Losses:
+    """Copy every message of any topic that can be read into a new, intact recording.
+
+    Args:
+        source: the damaged or unfinished file, not changed.
+        target: the file to write.
+        overwrite: whether an existing file at `target` may be replaced.
+
+    Returns:
+        What could not be read.
+
+    Raises:
+        InputError: `source` is no MCAP file at all, or `target` exists or cannot be written.
+    """
+    losses = Losses()
+    # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
+    writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
+    with writer, open_mcap(Path(source)) as file:
+        for _, channel, schema, message in iter_messages(file, read_summary(file), losses):
+            writer._copy(channel, schema, message)
+    return losses
+
+
 class RecordingWriter:
     """Write one recording; a context manager.
 
-    Everything goes to `<path>.part` first. Leaving the block renames it to `path`; leaving it with an
+    Everything goes to `<path>.part` first, so that `path` is a whole recording or not there. Leaving the block renames it to `path`; leaving it with an
     exception removes it, or leaves it for `streamfeat recover` when `keep_partial` is set. An existing file
     at `path` is untouched until the rename.
     """
@@ -52,6 +78,7 @@ class RecordingWriter:
         frame_id: str = "",
         overwrite: bool = False,
         keep_partial: bool = False,
+        part_suffix: str = ".part",
         chunk_size: int = 1 << 20,
     ) -> None:
         """Open the temporary file.
@@ -65,6 +92,7 @@ class RecordingWriter:
             frame_id: frame in the header of every message.
             overwrite: whether an existing file at `path` may be replaced.
             keep_partial: whether an exception leaves what was written so far.
+            part_suffix: what the name of the temporary file has after `path`.
             chunk_size: bytes before compression that one damaged spot in the file can cost.
 
         Raises:
@@ -74,10 +102,10 @@ class RecordingWriter:
         if compression not in _COMPRESSION:
             raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
         self.path = Path(path)
-        self._part = self.path.with_name(self.path.name + ".part")
+        self._part = self.path.with_name(self.path.name + part_suffix)
         self._overwrite, self._keep_partial = overwrite, keep_partial
         self._encoding, self._event_topic, self._frame_id = encoding, event_topic, frame_id
-        self._channels: dict[str, int] = {}
+        self._channels: dict[str | int, int] = {}
         self._seq = 0
         self._after_us = 0
         self._check_target()
@@ -217,8 +245,23 @@ class RecordingWriter:
         if topic not in self._channels:
             schema = self._writer.register_schema(message.SCHEMA_NAME, "ros2msg", message.SCHEMA.encode())
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        self._add(self._channels[topic], message.stamp_ns, data, message.stamp_ns, 0)
+
+    def _copy(self, channel: Channel, schema: Schema, message: Message) -> None:
+        """Write a message of another recording as it is; do not mix with the public ways to write."""
+        if channel.id not in self._channels:
+            schema_id = 0
+            if channel.schema_id:
+                schema_id = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._channels[channel.id] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, schema_id, channel.metadata
+            )
+        times = message.log_time, message.data, message.publish_time
+        self._add(self._channels[channel.id], *times, message.sequence)
+
+    def _add(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
         try:
-            self._writer.add_message(self._channels[topic], message.stamp_ns, data, message.stamp_ns)
+            self._writer.add_message(channel_id, log_time, data, publish_time, sequence)
         except OSError as error:
             raise self._unwritable(error) from None
 

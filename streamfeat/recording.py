@@ -22,7 +22,7 @@ from mcap.records import Channel, Message, Schema
 from streamfeat.codecs import Decoder, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.mcap_records import MAGIC, Losses, Summary, iter_records, read_summary
+from streamfeat.mcap_records import Losses, Summary, iter_messages, iter_records, open_mcap, read_summary
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 
 __all__ = ["Label", "Losses", "Packet", "Recording", "Sample", "Topic", "open_recording"]
@@ -144,7 +144,7 @@ class Recording:
     def __init__(self, path: str | PathLike[str], topic: str | None = None) -> None:
         """See `open_recording`."""
         self.path = Path(path)
-        self._file = _open_mcap(self.path)
+        self._file = open_mcap(self.path)
         try:
             summary = read_summary(self._file)
             # Counts from a summary tell what should be there; a scan can only tell what is.
@@ -187,9 +187,9 @@ class Recording:
         decoders: dict[str, Decoder] = {}
         seen: Counter[int] = Counter()
         last_seq: int | None = None
-        for at, channel, schema, message in self._messages(losses):
+        for at, channel, schema, message in iter_messages(self._file, self._known, losses):
             is_label = schema.name == LabelMessage.SCHEMA_NAME
-            if not is_label and channel.topic != self.topic:
+            if not is_label and (channel.topic != self.topic or schema.name not in _EVENT_SCHEMAS):
                 continue
             seen[channel.id] += 1
             item: Packet | Label
@@ -276,21 +276,6 @@ class Recording:
         """Time from the earliest to the latest event."""
         return (self.last_us or 0) - (self.first_us or 0)
 
-    def _messages(self, losses: Losses) -> Iterator[tuple[int, Channel, Schema, Message]]:
-        # Channels of the summary stand in for those in a damaged first chunk.
-        channels, schemas = dict(self._known.channels), dict(self._known.schemas)
-        for at, record in iter_records(self._file, losses):
-            if isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            else:
-                channel = channels.get(record.channel_id)
-                if channel is None:
-                    losses.add("unknown channel", len(record.data), f"byte {at}: channel {record.channel_id}")
-                elif channel.schema_id in schemas:
-                    yield at, channel, schemas[channel.schema_id], record
-
     def _first_packet(self) -> Packet:
         for item in self.items():
             if isinstance(item, Packet):
@@ -322,19 +307,6 @@ class Recording:
         schema = self._known.schemas.get(channel.schema_id)
         if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
             losses.add("missing message", 0, f"topic {channel.topic!r}: {missing} not found", missing)
-
-
-def _open_mcap(path: Path) -> BinaryIO:
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
-    magic = file.read(len(MAGIC))
-    if magic != MAGIC:
-        file.close()
-        what = "is empty" if not magic else "is not an MCAP recording"
-        raise InputError(f"{path}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
-    return file
 
 
 def _scan(file: BinaryIO) -> Summary:

@@ -19,7 +19,7 @@ from streamfeat.codecs import ENCODINGS, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.recorder import RecordingWriter
+from streamfeat.recorder import RecordingWriter, recover
 from streamfeat.recording import Label, Packet, Topic, open_recording
 
 RESOLUTION = (60, 80)
@@ -235,6 +235,9 @@ def test_interrupted_recording_is_kept_on_request_and_readable(tmp_path):
     assert (len(events), dict(losses.counts)) == (10, {"truncated": 1})
     with pytest.raises(InputError, match=r"a\.mcap\.part: left by a writer that did not finish"):
         RecordingWriter(path)
+    recover(part, path)
+    assert len(read(path)[0]) == 10
+    assert not read(path)[1]
 
 
 def test_nowhere_to_write(tmp_path):
@@ -486,3 +489,43 @@ def test_records_that_look_like_chunks_end_the_search(tmp_path, chunked):
     )
     assert found == packets
     assert losses.counts["damaged record"] >= 1
+
+
+# --- recovery
+
+
+def test_recover_copies_all_that_can_be_read(tmp_path, chunked):
+    data, packets, starts = chunked
+    at = starts[7] + 200
+    (tmp_path / "a.mcap").write_bytes(data[:at] + b"damage" + data[at + 6 : starts[15] + 99])
+    losses = recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert losses.counts == {"damaged chunk": 1, "truncated": 1}
+    found, losses = read_packets(tmp_path / "c.mcap", (tmp_path / "b.mcap").read_bytes())
+    assert (found, bool(losses)) == (packets[:7] + packets[8:15], False)
+
+
+def test_recover_of_no_recording(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"text")
+    with pytest.raises(InputError, match="is not an MCAP recording"):
+        recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_recover_keeps_messages_as_they_are(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("a/msg/B", "ros2idl", b"struct B {};")
+        with_schema = writer.register_channel("/b", "cdr", schema, {"offered_qos_profiles": "x"})
+        without = writer.register_channel("/json", "json", 0)
+        writer.add_message(with_schema, 5, b"one", 4, 3)
+        writer.add_message(without, 6, b"{}", 5, 4)
+        writer.finish()
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-60])
+    recover(tmp_path / "cut.mcap", tmp_path / "b.mcap")
+    contents = []
+    for each in (path, tmp_path / "b.mcap"):
+        with each.open("rb") as file:
+            contents.append(list(make_reader(file, validate_crcs=True).iter_messages()))
+    assert contents[0] == contents[1]
