@@ -63,9 +63,9 @@ def recover(source: str | PathLike[str], target: str | PathLike[str], *, overwri
 class RecordingWriter:
     """Write one recording; a context manager.
 
-    Everything goes to `<path>.part` first, so that `path` is a whole recording or not there. Leaving the block renames it to `path`; leaving it with an
-    exception removes it, or leaves it for `streamfeat recover` when `keep_partial` is set. An existing file
-    at `path` is untouched until the rename.
+    Everything goes to `<path>.part` first, so that `path` is a whole recording or not there. Leaving the
+    block renames it to `path`; leaving it with an exception removes it, or leaves it for
+    `streamfeat recover` when `keep_partial` is set. An existing file at `path` is untouched until then.
     """
 
     def __init__(
