@@ -193,12 +193,13 @@ class TestSensorWords:
         assert events["t"].tolist() == [0, 8192 + 10, 8192 + 10, 16_384 + 10]
         assert events["y"].tolist() == [5, 99, 7, 99]
 
-    def test_bin40_overflow_carries_over_blocks(self, tmp_path):
-        n = 200_000  # exactly one block
+    def test_bin40_overflow_adds_up_over_blocks(self, tmp_path):
         marker = make_events([0], [240], [0], [0])
-        later = make_events([1], [1], [1], [3])
-        data = bin40_bytes(np.concatenate([marker, make_events(*np.zeros((4, n), int)), later]))
-        assert read_events(file_of(tmp_path, "a.bin", data)).events["t"].tolist()[-2:] == [8192, 8195]
+        rest_of_block = make_events(*np.zeros((4, 199_999), int))
+        block = bin40_bytes(np.concatenate([marker, rest_of_block]))
+        path = file_of(tmp_path, "a.bin", block + block + bin40_bytes(make_events([1], [1], [1], [3])))
+        t = read_events(path).events["t"]
+        assert (t[0], t[199_998], t[199_999], t[-2], t[-1]) == (8192, 8192, 16_384, 16_384, 16_387)
 
     def test_evt2_counts_wraps_and_skips_events_before_any_time(self, tmp_path):
         last = (1 << 34) - 64
@@ -257,6 +258,10 @@ class TestTables:
         read = read_events(file_of(tmp_path, "a.txt", data))
         np.testing.assert_array_equal(read.events, make_events([1, 3], [2, 4], [1, 0], [10, 20]))
         assert read.resolution == (480, 640)
+
+    def test_the_first_line_is_skipped_once_not_in_each_block(self, tmp_path):
+        path = file_of(tmp_path, "a.txt", b"640 480\n" + b"1000000 100 100 1\n" * 60_000)
+        assert sum(map(len, open_events(path))) == 60_000
 
     def test_csv_with_names_in_any_order(self, tmp_path):
         path = file_of(tmp_path, "a.csv", b"x,y,polarity,timestamp\n1,2,1,10\n3,4,0,20")
