@@ -4,8 +4,8 @@ Lives here: headers of `% key value` lines, and fixed-size records to events, a 
 Not here: which format a file has (`streamfeat.camera_files`), and packets (`streamfeat.codecs`).
 
 Records of fixed size are a few lines of NumPy: 13 to 27 million events a second on two shared cores, where
-packets are written at 2 to 5, so a library would buy nothing. (EVT2: faery 15, eventcv 20, expelliarmus 49; N-CARS
-`.dat`: expelliarmus 67, the other two refuse its header.) EVT3 uses the decoder of packets, which reads
+packets are written at 2 to 5, so a library would buy nothing. (EVT2: faery 15, eventcv 20, expelliarmus 49;
+N-CARS `.dat`: expelliarmus 67, the other two refuse its header.) EVT3 uses the decoder of packets, reading
 t = TIME_HIGH << 12 | TIME_LOW as published. On recorded words where TIME_LOW steps back, expelliarmus 1.1.12
 adds 4096 us at each step, beyond what the TIME_HIGH words allow, and faery 0.7.1 holds the time until it is
 reached again. `tools/compare_decoders.py` prints all of this.
