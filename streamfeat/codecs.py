@@ -94,7 +94,7 @@ class LibcaerCmpDecoder:
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "libcaer_cmp")
-        out = _room_for(words, _LIBCAER_CMP_YIELD, "libcaer_cmp")
+        out = _room_for(words, 3, {5: 8}, "libcaer_cmp")
         n = decode_libcaer_cmp(words, time_base_ns // 1000, self._state, out)
         if n < 0:
             at = -1 - n
@@ -119,7 +119,7 @@ class Evt3Decoder:
     def decode(self, payload: bytes | memoryview, time_base_ns: int = 0) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "evt3")
-        out = _room_for(words, _EVT3_YIELD, "evt3")
+        out = _room_for(words, 0x2, {0x4: 12, 0x5: 8}, "evt3")
         return out[: decode_evt3(words, self._state, out)]
 
     def resync(self) -> None:
@@ -210,9 +210,19 @@ def _words(payload: bytes | memoryview, encoding: str) -> _Words:
     return _records(payload, np.dtype(np.uint16), encoding).copy()
 
 
-def _room_for(words: _Words, events_per_word: NDArray[np.uint8], encoding: str) -> Events:
-    """Allocate for all events that these words can hold."""
-    n = int(events_per_word[words].sum(dtype=np.int64))
+def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str) -> Events:
+    """Allocate for all events that these words can hold.
+
+    Args:
+        words: `(n,)`, type in the top four bits.
+        single: the type that is one event.
+        vectors: the types that are one event per set bit, with how many bits count.
+        encoding: named in the error.
+    """
+    kind = words >> 12
+    n = int(np.count_nonzero(kind == single))
+    for code, width in vectors.items():
+        n += int(np.bitwise_count(words[kind == code] & ((1 << width) - 1)).sum(dtype=np.int64))
     _check_count(n, MAX_PACKET_EVENTS, encoding)
     return np.zeros(n, EVENT_DTYPE)
 
@@ -221,19 +231,6 @@ def _check_count(n: int, limit: int, encoding: str) -> None:
     if n > limit:
         raise InputError(f"{encoding} payload: {n} records or events in one packet, more than {limit}")
 
-
-def _events_per_word(single: int, vectors: dict[int, int]) -> NDArray[np.uint8]:
-    """Tabulate, for each 16-bit word, how many events it emits."""
-    words = np.arange(1 << 16)
-    kind = words >> 12
-    table: NDArray[np.uint8] = (kind == single).astype(np.uint8)
-    for code, width in vectors.items():
-        table[kind == code] = np.bitwise_count(words[kind == code] & ((1 << width) - 1))
-    return table
-
-
-_EVT3_YIELD = _events_per_word(0x2, {0x4: 12, 0x5: 8})
-_LIBCAER_CMP_YIELD = _events_per_word(3, {5: 8})
 
 _ADDRESS_BITS = {"mono": (16, 15), "libcaer": (15, 15), "libcaer_cmp": (11, 11), "evt3": (11, 11)}
 

@@ -25,7 +25,10 @@ from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.mcap_records import Losses, Summary, iter_messages, iter_records, open_mcap, read_summary
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 
-__all__ = ["Label", "Losses", "Packet", "Recording", "Sample", "Topic", "open_recording"]
+__all__ = ["HELD_OUT_SPLITS", "Label", "Losses", "Packet", "Recording", "Sample", "Topic", "open_recording"]
+
+HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
+"""Splits that nothing is learned from."""
 
 _EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
 _MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
