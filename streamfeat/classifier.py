@@ -4,7 +4,6 @@ Lives here: normalising pooled features, training with cross-validation, saving,
 Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors.numpy import save
 from sklearn.linear_model import SGDClassifier
 from sklearn.model_selection import GridSearchCV, StratifiedKFold
 from sklearn.pipeline import make_pipeline
@@ -20,13 +18,14 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
-from streamfeat.files import write_atomically
-from streamfeat.safe_arrays import read_safetensors
+from streamfeat.safe_arrays import read_safetensors, write_safetensors
 from streamfeat.svm import LinearSVM
 
 __all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
 
 FORMAT_VERSION = 1
+
+_KIND = "streamfeat-classifier"
 
 
 def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -115,13 +114,11 @@ class Classifier:
         """Write one safetensors file; the file appears whole or not at all."""
         arrays = {name: getattr(self, name) for name in ("centre", "scale", "weights", "bias")}
         header = {
-            "format": "streamfeat-classifier",
-            "version": FORMAT_VERSION,
             "labels": list(self.labels),
             "fingerprint": self.fingerprint,
             "provenance": dict(self.provenance),
         }
-        write_atomically(Path(path), save(arrays, metadata={"streamfeat": json.dumps(header)}))
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -130,10 +127,10 @@ class Classifier:
         Raises:
             InputError: the file is missing, cut short, of another version, or not a classifier.
         """
-        arrays, header = read_safetensors(Path(path), "streamfeat-classifier", FORMAT_VERSION)
-        labels, fingerprint = header.get("labels"), header.get("fingerprint")
-        provenance = header.get("provenance", {})
-        sound = isinstance(labels, list) and len(labels) >= 2 and all(isinstance(n, str) for n in labels)
+        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        fingerprint, provenance = header.get("fingerprint"), header.get("provenance", {})
+        labels = header["labels"] if isinstance(header.get("labels"), list) else []
+        sound = len(labels) >= 2 and all(isinstance(name, str) for name in labels)
         if not (sound and isinstance(fingerprint, str) and isinstance(provenance, dict)):
             raise InputError(f"{path}: labels, fingerprint or provenance are missing; train it again")
         columns = 1 if len(labels) == 2 else len(labels)

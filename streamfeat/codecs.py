@@ -301,11 +301,11 @@ def _encode_evt3(events: Events, after_us: int) -> bytes:
 
 def _evt3_bridge(start: int, stop: int) -> _Words:
     """TIME_HIGH words from `start` towards `stop` in steps that count every wrap."""
-    bridge: NDArray[np.int64] = np.arange(start, stop, _EVT3_MAX_STEP)
-    if len(bridge) > _EVT3_MAX_BRIDGE:
+    if stop - start > _EVT3_MAX_STEP * _EVT3_MAX_BRIDGE:
         raise InputError(
             f"evt3 has 24-bit time and cannot jump from {start << 12} to {stop << 12} us; "
             "subtract an offset from all times, or write mono"
         )
+    bridge: NDArray[np.int64] = np.arange(start, stop, _EVT3_MAX_STEP)
     words: _Words = (0x8000 | bridge & 0xFFF).astype("<u2")
     return words

@@ -6,7 +6,6 @@ Not here: learning the matrices (`learn`), and anything that changes as events c
 
 import dataclasses
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,11 +14,9 @@ from typing import Any, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import save
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.files import write_atomically
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.layout import (
     ENCODINGS,
@@ -30,12 +27,14 @@ from streamfeat.kernels.layout import (
     TRIANGLE,
     Operator,
 )
-from streamfeat.safe_arrays import one_line, read_safetensors
+from streamfeat.safe_arrays import one_line, read_safetensors, write_safetensors
 from streamfeat.window import encode_window
 
 __all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "Formulation"]
 
 FORMAT_VERSION = 1
+
+_KIND = "streamfeat-encoder"
 
 Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
@@ -182,8 +181,6 @@ class Encoder:
         arrays = {"filters": self.filters, "whitening": self.whitening, "mean": self.mean}
         arrays |= {name: getattr(operator, name) for name in _STORED_ARRAYS}
         header = {
-            "format": "streamfeat-encoder",
-            "version": FORMAT_VERSION,
             "geometry": dataclasses.asdict(self.geometry),
             "formulation": self.formulation,
             "encoding": self.encoding,
@@ -191,7 +188,7 @@ class Encoder:
             "scalars": {name: getattr(operator, name) for name in _STORED_SCALARS},
             "provenance": dict(self.provenance),
         }
-        write_atomically(Path(path), save(arrays, metadata={"streamfeat": json.dumps(header)}))
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -200,7 +197,7 @@ class Encoder:
         Raises:
             InputError: the file is missing, cut short, of another version, or not a model.
         """
-        arrays, header = read_safetensors(Path(path), "streamfeat-encoder", FORMAT_VERSION)
+        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
         try:
             return cls._from_parts(arrays, header)
         except (KeyError, TypeError, ValueError, AttributeError) as error:

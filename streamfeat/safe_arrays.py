@@ -1,19 +1,33 @@
-"""Reading the safetensors files that models and classifiers are kept in.
+"""The safetensors files that models and classifiers are kept in.
 
-Lives here: arrays and a JSON header out of bytes that nobody has vouched for.
+Lives here: arrays and a JSON header, written whole, and read from bytes that nobody has vouched for.
 Not here: what the arrays mean; whoever asks for them checks shapes and ranges.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from streamfeat.errors import InputError
+from streamfeat.files import write_atomically
 
-__all__ = ["one_line", "read_safetensors"]
+__all__ = ["one_line", "read_safetensors", "write_safetensors"]
+
+
+def write_safetensors(
+    path: Path, kind: str, version: int, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+) -> None:
+    """Write arrays and a JSON header as one file, which appears whole or not at all."""
+    # safetensors writes the buffer of an array as it lies, so a transposed view would come back scrambled.
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    text = json.dumps({"format": kind, "version": version, **header})
+    write_atomically(path, save(contiguous, metadata={"streamfeat": text}))
 
 
 def one_line(error: BaseException) -> str:

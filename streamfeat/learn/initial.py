@@ -35,4 +35,4 @@ def random_directions(white: NDArray[np.float32], n: int, rng: Any) -> NDArray[n
     if len(rows) < n:
         more = rng.standard_normal((n - len(rows), white.shape[1])).astype(np.float32)
         rows = np.concatenate([rows, more / np.linalg.norm(more, axis=1, keepdims=True)])
-    return rows.astype(np.float32)
+    return np.asarray(rows, np.float32)

@@ -124,7 +124,7 @@ class TransformLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self)
         white = validate_data(self, X, dtype=np.float32, reset=False)
         z = white @ self.components_.T
-        return z - z.clip(-np.float32(self.threshold), np.float32(self.threshold))
+        return np.asarray(z - z.clip(-np.float32(self.threshold), np.float32(self.threshold)))
 
     def _second_moment(self, white: NDArray[np.float32]) -> NDArray[np.float64]:
         total = np.zeros((white.shape[1],) * 2)

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
-from streamfeat.recording import Label, Packet
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet
 from streamfeat.window import count_window
 
 __all__ = ["Volumes", "Window", "sample_volumes", "windows_of"]
-
-_HELD_OUT = frozenset({"validation", "valid", "val", "test"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,7 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
     origin = 0
 
     def window() -> Iterator[Window]:
-        if pending and not (label and label.split in _HELD_OUT):
+        if pending and not (label and label.split in HELD_OUT_SPLITS):
             last = label.start_us + label.duration_us - 1 if label else origin + geometry.window_us - 1
             yield Window(np.concatenate(pending), resolution, origin, last)
         pending.clear()
@@ -118,10 +116,10 @@ def sample_volumes(
         rows = rng.integers(0, places.shape[1], 4 * per_window)
         columns = rng.integers(0, places.shape[2], 4 * per_window)
         volumes = places[:, rows, columns].transpose(1, 0, 2, 3).reshape(4 * per_window, -1)
-        filled = volumes.any(axis=1)
-        drawn += len(filled)
-        empty += len(filled) - int(filled.sum())
-        for volume in volumes[filled][:per_window]:
+        filled = np.flatnonzero(volumes.any(axis=1))
+        drawn += len(volumes)
+        empty += len(volumes) - len(filled)
+        for volume in volumes[filled[:per_window]]:
             slot = seen if seen < n_volumes else int(rng.integers(0, seen + 1))
             if slot < n_volumes:
                 kept[slot] = volume

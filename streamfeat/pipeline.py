@@ -1,0 +1,217 @@
+"""The asynchronous pipeline: source, session and sinks, joined by bounded queues.
+
+Lives here: every task and queue of the package, pacing, and ending well.
+Not here: what is computed (`session`), read (`recording`) or written (`sinks`).
+
+Three tasks: one reads and decodes, one runs the kernels, one writes. Blocking work happens in a thread of
+each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full, whoever
+fills it waits, so a replay loses nothing and needs no more memory than a few packets.
+
+Ending: when the source is exhausted or `stop` is set, what is in the queues is processed and the sinks are
+closed. When a task fails, the others are cancelled and the sinks are closed as failed.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import islice
+from types import TracebackType
+
+import numpy as np
+
+from streamfeat.emission import Emission
+from streamfeat.recording import Label, Packet
+from streamfeat.session import Session
+from streamfeat.sinks import Sink
+
+__all__ = ["Pipeline", "PipelineStats"]
+
+Item = Packet | Label
+
+_QUEUE_ITEMS = 8
+_EVENTS_A_HOP = 32_768
+"""Items are handed on in groups of about so many events: a hop between threads costs 50 to 100 us."""
+_EMISSIONS_A_HOP = 256
+_PACED_SLICE_US = 10_000
+"""At recorded pace packets are cut to this length, so that nothing waits for the end of a long packet."""
+
+
+@dataclass(slots=True)
+class PipelineStats:
+    """What is under way.
+
+    Attributes:
+        items: items read from the source.
+        queued_in: groups of items that wait for the session, at most 8.
+        queued_out: groups of emissions that wait for the sinks, at most 8.
+        dropped: items dropped; always 0, a full queue makes its producer wait.
+        stopped: the source was stopped before its end.
+    """
+
+    items: int = 0
+    queued_in: int = 0
+    queued_out: int = 0
+    dropped: int = 0
+    stopped: bool = False
+
+
+class Pipeline:
+    """Runs the items of a recording through a session into sinks.
+
+    Args:
+        items: packets and labels in stream order; iterated in a thread of its own.
+        session: what is done with them.
+        sinks: written to in this order.
+        speed: stream seconds for each second of the clock; None for as fast as possible.
+        on_progress: called on the event loop's thread after each group, with stream time in microseconds.
+    """
+
+    def __init__(
+        self,
+        items: Iterable[Item],
+        session: Session,
+        sinks: Sequence[Sink],
+        *,
+        speed: float | None = None,
+        on_progress: Callable[[int], None] = lambda t_us: None,
+    ) -> None:
+        """Nothing runs before `run`."""
+        self._items = items
+        self._session = session
+        self._sinks = sinks
+        self._speed = speed
+        self._on_progress = on_progress
+        self._inbox: asyncio.Queue[list[Item] | None] = asyncio.Queue(_QUEUE_ITEMS)
+        self._outbox: asyncio.Queue[list[Emission] | None] = asyncio.Queue(_QUEUE_ITEMS)
+        self._stop = asyncio.Event()
+        self._stats = PipelineStats()
+
+    def stop(self) -> None:
+        """End the source; what has been read is still processed and written. Call from the loop's thread."""
+        self._stop.set()
+
+    def stats(self) -> PipelineStats:
+        """A copy of the counts, with the present depth of the queues."""
+        return replace(self._stats, queued_in=self._inbox.qsize(), queued_out=self._outbox.qsize())
+
+    async def run(self) -> None:
+        """Run until the source ends or is stopped. Errors of any part come out as they were raised."""
+        with ExitStack() as closing:
+            for sink in self._sinks:
+                closing.push(_Closing(sink))
+            # Threads end before sinks are closed: a cancelled write may still be under way in one.
+            with ThreadPoolExecutor(3, thread_name_prefix="streamfeat") as threads:
+                try:
+                    async with asyncio.TaskGroup() as tasks:
+                        tasks.create_task(self._read(threads))
+                        tasks.create_task(self._compute(threads))
+                        tasks.create_task(self._write(threads))
+                except BaseExceptionGroup as group:
+                    raise group.exceptions[0] from None
+
+    async def _read(self, threads: ThreadPoolExecutor) -> None:
+        loop = asyncio.get_running_loop()
+        paced = self._speed is not None
+        groups = iter(_paced_groups(self._items) if paced else _full_groups(self._items))
+        started: tuple[float, int] | None = None
+        while not self._stop.is_set():
+            group = await loop.run_in_executor(threads, next, groups, None)
+            if group is None:
+                break
+            t_us = _stream_time(group)
+            if self._speed is not None and t_us is not None:
+                started = started or (time.monotonic(), t_us)
+                due = started[0] + (t_us - started[1]) / (1e6 * self._speed)
+                await self._sleep_until(due)
+            await self._inbox.put(group)
+            self._stats.items += len(group)
+            if t_us is not None:
+                self._on_progress(t_us)
+        self._stats.stopped = self._stop.is_set()
+        await self._inbox.put(None)
+
+    async def _sleep_until(self, due: float) -> None:
+        wait = due - time.monotonic()
+        if wait > 0:
+            try:
+                await asyncio.wait_for(self._stop.wait(), wait)
+            except TimeoutError:
+                return
+
+    async def _compute(self, threads: ThreadPoolExecutor) -> None:
+        loop = asyncio.get_running_loop()
+        more = True
+        while more:
+            group = await self._inbox.get()
+            more = group is not None
+            emissions = self._emissions(group)
+            # One packet can give as many emissions as it has events: they are handed on in parts.
+            while part := await loop.run_in_executor(threads, _take, emissions):
+                await self._outbox.put(part)
+        await self._outbox.put(None)
+
+    def _emissions(self, group: list[Item] | None) -> Iterator[Emission]:
+        if group is None:
+            yield from self._session.finish()
+        else:
+            for item in group:
+                yield from self._session.process(item)
+
+    async def _write(self, threads: ThreadPoolExecutor) -> None:
+        loop = asyncio.get_running_loop()
+        while (part := await self._outbox.get()) is not None:
+            for sink in self._sinks:
+                await loop.run_in_executor(threads, sink.write, part)
+
+
+class _Closing:
+    """Closes a sink, as failed when the block it guards has failed."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self._sink.close(failed=kind is not None)
+
+
+def _take(emissions: Iterator[Emission]) -> list[Emission]:
+    return list(islice(emissions, _EMISSIONS_A_HOP))
+
+
+def _full_groups(items: Iterable[Item]) -> Iterator[list[Item]]:
+    group: list[Item] = []
+    events = 0
+    for item in items:
+        group.append(item)
+        events += len(item.events) if isinstance(item, Packet) else 0
+        if events >= _EVENTS_A_HOP:
+            yield group
+            group, events = [], 0
+    if group:
+        yield group
+
+
+def _paced_groups(items: Iterable[Item]) -> Iterator[list[Item]]:
+    for item in items:
+        if isinstance(item, Label) or len(item.events) == 0:
+            yield [item]
+            continue
+        latest = np.maximum.accumulate(item.events["t"])
+        start = 0
+        while start < len(latest):
+            stop = int(np.searchsorted(latest, latest[start] + _PACED_SLICE_US))
+            yield [replace(item, events=item.events[start:stop])]
+            start = stop
+
+
+def _stream_time(group: list[Item]) -> int | None:
+    """The time by which a group is complete: that of its latest event."""
+    last = group[-1]
+    if isinstance(last, Label):
+        return last.start_us
+    return int(last.events["t"].max()) if len(last.events) else None

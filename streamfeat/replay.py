@@ -1,0 +1,166 @@
+"""The main job on a recording: files in, emissions out, a summary at the end.
+
+Lives here: opening what a replay needs, running the pipeline until it ends or is interrupted, the result.
+Not here: how it is computed (`session`, `pipeline`), how it looks (`sinks`, `cli`).
+"""
+
+import asyncio
+import signal
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.console import Console
+
+from streamfeat.classifier import Classifier
+from streamfeat.emission import EmitPolicy
+from streamfeat.encoder import Encoder
+from streamfeat.errors import InputError
+from streamfeat.mcap_records import Losses
+from streamfeat.pipeline import Pipeline
+from streamfeat.recorder import RecordingWriter
+from streamfeat.recording import Label, Packet, Recording, open_recording
+from streamfeat.session import Session
+from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink
+
+__all__ = ["Replay", "items_of_split"]
+
+
+class Replay:
+    """One replay of one recording.
+
+    Args:
+        recording: MCAP file.
+        model: of the encoder.
+        classifier: to predict with; none for features alone, or to learn from nothing with `learn_online`.
+        emit: when to read, see `EmitPolicy.parse`.
+        speed: a number for a multiple of the recorded pace, or `max`.
+        topic: event topic, where there are several.
+        split: replay only samples of this split.
+        learn_online: learn from each labelled sample after predicting it.
+
+    Raises:
+        InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        recording: Path,
+        model: Path,
+        classifier: Path | None = None,
+        *,
+        emit: str = "auto",
+        speed: str = "max",
+        topic: str | None = None,
+        split: str | None = None,
+        learn_online: bool = False,
+    ) -> None:
+        """Open and check everything, so that nothing is written when something does not fit."""
+        policy = EmitPolicy.parse(emit)
+        self._speed = _parse_speed(speed)
+        self._split = split
+        self._topic = topic
+        self._recording = recording
+        encoder = Encoder.load(model)
+        reader = Classifier.load(classifier) if classifier else None
+        with open_recording(recording, topic) as rec:
+            encoder.geometry.grid_shape(rec.resolution)
+            if learn_online and reader is None:
+                reader = Classifier.untrained([label.label for label in rec.labels], encoder)
+            if split is not None and split not in {label.split for label in rec.labels}:
+                raise InputError(f"{recording}: has no samples of split {split!r}")
+        if reader:
+            reader.check_fits(encoder, path=classifier or "the classifier")
+        self._session = Session(encoder, policy, reader, learn_online=learn_online, clock=time.perf_counter)
+        self._seconds = 0.0
+        self.interrupted = False
+        self.losses = Losses()
+
+    def run(
+        self,
+        *,
+        console: Console | None = None,
+        recording_out: Path | None = None,
+        json_lines: Path | TextIO | None = None,
+        with_features: bool = False,
+    ) -> None:
+        """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
+
+        Args:
+            console: for live lines.
+            recording_out: MCAP file for features and predictions; replaced if it exists.
+            json_lines: file (replaced) or open stream for a JSON line for each emission.
+            with_features: include features in JSON lines.
+        """
+        sinks: list[Sink] = []
+        if console:
+            sinks.append(TerminalSink(console))
+        if json_lines:
+            sinks.append(JsonLinesSink(json_lines, features=with_features))
+        if recording_out:
+            sinks.append(RecordingSink(RecordingWriter(recording_out, overwrite=True)))
+        with open_recording(self._recording, self._topic) as rec:
+            started = time.perf_counter()
+            asyncio.run(self._run(rec, sinks))
+            self._seconds = time.perf_counter() - started
+            self.losses = rec.losses
+
+    async def _run(self, recording: Recording, sinks: list[Sink]) -> None:
+        items = items_of_split(recording.items(), self._split)
+        pipeline = Pipeline(items, self._session, sinks, speed=self._speed)
+        loop = asyncio.get_running_loop()
+        for name in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(name, pipeline.stop)
+        try:
+            await pipeline.run()
+        finally:
+            for name in (signal.SIGINT, signal.SIGTERM):
+                loop.remove_signal_handler(name)
+        self.interrupted = pipeline.stats().stopped
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        stats = self._session.stats()
+        result: dict[str, Any] = {
+            "events": stats.events,
+            "seconds": round(self._seconds, 3),
+            "events_per_s": round(stats.events / max(self._seconds, 1e-9)),
+            "emissions": stats.emissions,
+            "samples": stats.samples,
+        }
+        if stats.correct is not None and stats.samples:
+            result["correct"] = stats.correct
+            result["accuracy"] = round(stats.correct / stats.samples, 4)
+        if stats.unknown_labels:
+            result["unknown_labels"] = stats.unknown_labels
+        return result | {
+            "dropped": 0,
+            "late": stats.late,
+            "rejected": stats.rejected,
+            "saturated": stats.saturated,
+            "lost": sum(self.losses.counts.values()),
+            "interrupted": self.interrupted,
+        }
+
+
+def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterator[Packet | Label]:
+    """Only the labels of one split, and the packets that follow them; all items if `split` is None."""
+    wanted = split is None
+    for item in items:
+        if split is not None and isinstance(item, Label):
+            wanted = item.split == split
+        if wanted:
+            yield item
+
+
+def _parse_speed(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = 0.0
+    if not 0 < speed < 1e9:
+        raise InputError(f"--speed {text!r} is not understood; give a number above zero, or max")
+    return speed

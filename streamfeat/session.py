@@ -1,0 +1,247 @@
+"""From the items of a stream to emissions, one item at a time and synchronously.
+
+Lives here: which engine an event goes to, where labelled samples begin and end, when features are read,
+predicting and, on request, learning from labels.
+Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, where one is needed, is given.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.classifier import Classifier, OnlineClassifier
+from streamfeat.emission import Emission, EmitPolicy
+from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
+from streamfeat.events import Events, Resolution
+from streamfeat.recording import Label, Packet
+
+__all__ = ["Session", "SessionStats"]
+
+_NO_SCORES = np.zeros(0, np.float32)
+_AUTO_REST = 4.0
+"""Under `auto`, time that passes after a reading, in multiples of what that reading took."""
+
+
+@dataclass(slots=True)
+class SessionStats:
+    """What a session has done.
+
+    Attributes:
+        events: accepted.
+        late: older than the window.
+        rejected: outside the sensor, or malformed.
+        saturated: accepted without changing a clipped count.
+        emissions: readings made.
+        samples: labelled samples that ended.
+        correct: of those, how many were predicted rightly; None without a classifier.
+        unknown_labels: samples that could not be learned from, because the classifier lacks their label.
+    """
+
+    events: int = 0
+    late: int = 0
+    rejected: int = 0
+    saturated: int = 0
+    emissions: int = 0
+    samples: int = 0
+    correct: int | None = None
+    unknown_labels: int = 0
+
+
+class Session:
+    """Feeds one camera's packets and labels to an engine, and reads it as the policy says.
+
+    A labelled sample starts with an empty window and its own origin, so its features are those of the
+    offline path. Packets of another resolution start a new engine.
+
+    Args:
+        encoder: the frozen encoder.
+        policy: when to read.
+        classifier: predicts from each reading.
+        learn_online: learn from each labelled sample after predicting it (prequential).
+        clock: seconds, monotonic; used by the `auto` policy only.
+
+    Raises:
+        InputError: the classifier does not fit the encoder.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        policy: EmitPolicy,
+        classifier: Classifier | None = None,
+        *,
+        learn_online: bool = False,
+        clock: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """Check that the parts fit; the engine comes with the first packet."""
+        if classifier:
+            classifier.check_fits(encoder)
+        self.encoder = encoder
+        self.policy = policy
+        self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
+        self._classifier = classifier
+        self._clock = clock
+        self._engine: Engine | None = None
+        self._sample: Label | None = None
+        self._seen_label = False
+        self._origin = 0
+        self._last_us = 0
+        self._unread = 0
+        self._next_us: int | None = None
+        self._rest_until = 0.0
+        self._stats = SessionStats(correct=0 if classifier else None)
+
+    @property
+    def classifier(self) -> Classifier | None:
+        """The classifier as it is now."""
+        return self.learner.classifier if self.learner else self._classifier
+
+    def stats(self) -> SessionStats:
+        """What has been done so far, a copy."""
+        total = SessionStats(**{name: getattr(self._stats, name) for name in SessionStats.__slots__})
+        if self._engine:
+            _add_engine(total, self._engine)
+        return total
+
+    def process(self, item: Packet | Label) -> Iterator[Emission]:
+        """Take in one item of the stream, and yield what is read on the way."""
+        if isinstance(item, Label):
+            yield from self._finish_sample()
+            self._sample, self._seen_label = item, True
+            self._origin = item.start_us
+            self._last_us = item.start_us
+            self._next_us = None
+            if self._engine:
+                self._engine.restart(item.start_us)
+            return
+        events = item.events
+        if len(events) == 0:
+            return
+        engine = self._engine_for(item.resolution)
+        latest = np.maximum.accumulate(events["t"])
+        end = len(events)
+        if self._sample:
+            stop = self._sample.start_us + self._sample.duration_us
+            end = int(np.searchsorted(latest, stop))
+        yield from self._feed(engine, events[:end], latest[:end])
+        if end < len(events):
+            yield from self._finish_sample()
+            yield from self._feed(engine, events[end:], latest[end:])
+
+    def finish(self) -> Iterator[Emission]:
+        """End the stream: the open sample is read, and what was collected is learned."""
+        yield from self._finish_sample()
+        if self._unread and self._engine:
+            yield self._read(self._engine, self._last_us + 1)
+        if self.learner:
+            self.learner.flush()
+
+    def _engine_for(self, resolution: Resolution) -> Engine:
+        if self._engine and self._engine.resolution == resolution:
+            return self._engine
+        if self._engine:
+            _add_engine(self._stats, self._engine)
+        self._engine = Engine(self.encoder, resolution, origin_us=self._origin)
+        return self._engine
+
+    def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        if len(events) == 0:
+            return
+        if self.policy.kind == "time":
+            yield from self._feed_by_time(engine, events, latest)
+        elif self.policy.kind == "events":
+            yield from self._feed_by_count(engine, events, latest)
+        else:
+            self._take(engine, events, latest)
+            now = self._clock()
+            if now >= self._rest_until:
+                yield self._read(engine, self._last_us + 1)
+                spent = self._clock() - now
+                self._rest_until = now + spent * (1 + _AUTO_REST)
+
+    def _feed_by_count(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        start = 0
+        while start < len(events):
+            stop = min(start + self.policy.every - self._unread, len(events))
+            self._take(engine, events[start:stop], latest[start:stop])
+            start = stop
+            if self._unread == self.policy.every:
+                yield self._read(engine, self._last_us + 1)
+
+    def _feed_by_time(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        start = 0
+        while start < len(events):
+            due = self._due(int(latest[start]))
+            stop = int(np.searchsorted(latest, due)) if due is not None else len(events)
+            if stop > start:
+                self._take(engine, events[start:stop], latest[start:stop])
+                start = stop
+            elif due is not None:
+                yield self._read(engine, due)
+                self._next_us = due + self.policy.every
+
+    def _due(self, t_us: int) -> int | None:
+        """When to read next, given an event at `t_us`; readings of an empty window are passed over."""
+        every = self.policy.every
+        following = t_us - (t_us - self._origin) % every + every
+        if self._next_us is None:
+            self._next_us = following
+        # After this nothing changes until the next event. Between labelled samples nobody asks.
+        silent = self._last_us + (0 if self._seen_label and not self._sample else self._window_us + every)
+        if self._next_us > silent and not self._unread:
+            self._next_us = following
+        return self._next_us
+
+    @property
+    def _window_us(self) -> int:
+        return self.encoder.geometry.window_us
+
+    def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
+        engine.feed(events)
+        self._unread += len(events)
+        self._last_us = max(self._last_us, int(latest[-1]))
+
+    def _read(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
+        engine.advance(t_us - 1)
+        features = engine.features()
+        self._unread = 0
+        self._stats.emissions += 1
+        classifier = self.classifier
+        return Emission(
+            t_us=t_us,
+            n_events=self._stats.events + engine.stats().events,
+            features=features,
+            labels=classifier.labels if classifier else (),
+            scores=classifier.scores(features) if classifier else _NO_SCORES,
+            sample=self._sample,
+            final=final,
+        )
+
+    def _finish_sample(self) -> Iterator[Emission]:
+        sample = self._sample
+        if sample is None:
+            return
+        self._stats.samples += 1
+        engine = self._engine or self._engine_for((self.encoder.geometry.patch,) * 2)
+        emission = self._read(engine, sample.start_us + sample.duration_us, final=True)
+        if emission.correct and self._stats.correct is not None:
+            self._stats.correct += 1
+        if self.learner:
+            if sample.label in self.learner.classifier.labels:
+                self.learner.learn_one(emission.features, sample.label)
+            else:
+                self._stats.unknown_labels += 1
+        self._sample = None
+        self._next_us = None
+        yield emission
+
+
+def _add_engine(stats: SessionStats, engine: Engine) -> None:
+    seen = engine.stats()
+    stats.events += seen.events
+    stats.late += seen.late
+    stats.rejected += seen.rejected
+    stats.saturated += seen.saturated

@@ -1,0 +1,169 @@
+"""Where emissions go: the terminal, JSON lines, MCAP.
+
+Lives here: `Sink` and its three kinds; each is written to by one task, off the event loop's thread.
+Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`).
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from rich.console import Console
+from rich.text import Text
+
+from streamfeat.emission import Emission
+from streamfeat.errors import InputError
+from streamfeat.recorder import RecordingWriter
+
+__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record"]
+
+_LINES_A_SECOND = 8.0
+
+
+class Sink(Protocol):
+    """Takes emissions in order. May block; is called from one thread at a time."""
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Take some emissions, at least one."""
+
+    def close(self, *, failed: bool) -> None:
+        """End: finish what was written, or (`failed`) leave nothing half done behind."""
+
+
+def emission_record(emission: Emission, *, features: bool = False) -> dict[str, Any]:
+    """An emission as JSON values."""
+    record: dict[str, Any] = {"t_us": emission.t_us, "n_events": emission.n_events}
+    if emission.labels:
+        record["prediction"] = emission.prediction
+        record["scores"] = {
+            label: round(float(score), 6)
+            for label, score in zip(emission.labels, emission.scores, strict=True)
+        }
+    if emission.sample:
+        record["sample"] = {
+            "label": emission.sample.label,
+            "elapsed_us": emission.t_us - emission.sample.start_us,
+            "source": emission.sample.source,
+            "final": emission.final,
+        }
+    if features:
+        record["features"] = [float(value) for value in emission.features]
+    return record
+
+
+class JsonLinesSink:
+    """One JSON object a line; to a file, which appears when complete, or to an open stream."""
+
+    def __init__(self, target: Path | TextIO, *, features: bool = False) -> None:
+        """Open the target.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        self._path = target if isinstance(target, Path) else None
+        self._features = features
+        try:
+            self._part = self._path.with_name(self._path.name + ".part") if self._path else None
+            self._stream = self._part.open("w") if self._part else target
+        except OSError as error:
+            raise InputError(f"{target}: cannot write there: {error.strerror}") from error
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Write a line for each emission."""
+        lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
+        self._stream.writelines(lines)  # type: ignore[union-attr]
+
+    def close(self, *, failed: bool) -> None:
+        """Put the file in its place, or remove it."""
+        if self._path is None or self._part is None:
+            self._stream.flush()  # type: ignore[union-attr]
+            return
+        self._stream.close()  # type: ignore[union-attr]
+        if failed:
+            self._part.unlink(missing_ok=True)
+        else:
+            self._part.replace(self._path)
+
+
+class RecordingSink:
+    """Features, predictions and labels as MCAP messages."""
+
+    def __init__(self, writer: RecordingWriter) -> None:
+        """Write with `writer`, which is closed with the sink."""
+        self._writer = writer.__enter__()
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Write a features message for each emission, and a prediction where there is one."""
+        for e in emissions:
+            if e.final and e.sample:
+                self._writer.write_label(e.sample)
+            self._writer.write_features(e.t_us, e.n_events, e.features)
+            if e.prediction is not None:
+                self._writer.write_prediction(e.t_us, e.prediction, e.labels, e.scores)
+
+    def close(self, *, failed: bool) -> None:
+        """Finish the file, or leave none."""
+        error = InputError("abandoned") if failed else None
+        self._writer.__exit__(type(error) if error else None, error, None)
+
+
+class TerminalSink:
+    """A line for each labelled sample, or for each second without labels; never a flood.
+
+    Args:
+        console: where to print.
+        clock: seconds, monotonic.
+    """
+
+    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+        """Start with nothing seen."""
+        self._console = console
+        self._clock = clock
+        self._next = 0.0
+        self._samples = 0
+        self._correct = 0
+        self._skipped = 0
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Count every emission, and show one where it is time to."""
+        for e in emissions:
+            if e.final:
+                self._samples += 1
+                self._correct += bool(e.correct)
+        shown = next((e for e in reversed(emissions) if e.final), None)
+        if shown is None:
+            if any(e.sample for e in emissions):
+                return
+            shown = emissions[-1]
+        if self._clock() < self._next:
+            self._skipped += sum(e.final for e in emissions) or 0
+            return
+        self._next = self._clock() + (1 / _LINES_A_SECOND if shown.final else 1.0)
+        self._console.print(self._line(shown), highlight=False)
+
+    def close(self, *, failed: bool) -> None:
+        """Say how many samples were not shown."""
+        if self._skipped:
+            self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
+
+    def _line(self, e: Emission) -> Text:
+        line = Text(f"{e.t_us / 1e6:9.3f} s  ", style="dim")
+        line.append(f"{e.n_events:>11,} events  ", style="default")
+        if e.prediction is not None:
+            margin = sorted(e.scores, reverse=True)
+            line.append(f"{e.prediction:>12}", style="bold")
+            line.append(f" {margin[0] - margin[1]:+6.2f}  ", style="dim")
+        if e.sample and e.final:
+            if e.correct is None:
+                line.append(f"is {e.sample.label}")
+            else:
+                line.append("right" if e.correct else "wrong", style="green" if e.correct else "red")
+                line.append(f"  is {e.sample.label:<12}")
+                line.append(f"{100 * self._correct / self._samples:6.1f} % of {self._samples}", style="dim")
+        elif e.prediction is None:
+            quadrants = e.features.reshape(4, -1)
+            line.append("energy by quadrant  ", style="dim")
+            line.append("  ".join(f"{float(abs(q).sum()):9.1f}" for q in quadrants))
+        return line
