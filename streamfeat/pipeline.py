@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from types import TracebackType
 
@@ -101,7 +102,7 @@ class Pipeline:
         """Run until the source ends or is stopped. Errors of any part come out as they were raised."""
         with ExitStack() as closing:
             for sink in self._sinks:
-                closing.push(_Closing(sink))
+                closing.push(partial(_close, sink))
             # Threads end before sinks are closed: a cancelled write may still be under way in one.
             with ThreadPoolExecutor(3, thread_name_prefix="streamfeat") as threads:
                 try:
@@ -167,16 +168,10 @@ class Pipeline:
                 await loop.run_in_executor(threads, sink.write, part)
 
 
-class _Closing:
-    """Closes a sink, as failed when the block it guards has failed."""
-
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self._sink.close(failed=kind is not None)
+def _close(
+    sink: Sink, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+) -> None:
+    sink.close(failed=kind is not None)
 
 
 def _take(emissions: Iterator[Emission]) -> list[Emission]:
