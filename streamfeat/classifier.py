@@ -157,7 +157,7 @@ def train_classifier(
     labels: Sequence[str],
     encoder: Encoder,
     *,
-    candidates: Sequence[float] = (1e-4, 1e-3, 1e-2, 1e-1, 1.0),
+    candidates: Sequence[float] = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1),
     folds: int = 3,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,

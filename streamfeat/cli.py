@@ -166,7 +166,7 @@ def convert(
     as_json: JsonOption = False,
 ) -> None:
     """A data set folder or a camera file to MCAP, with labels and splits from the folder layout."""
-    from streamfeat import datasets
+    from streamfeat.foreign import datasets
 
     with progress_bars() as report:
         done = datasets.convert(

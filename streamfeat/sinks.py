@@ -149,21 +149,23 @@ class TerminalSink:
             self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
 
     def _line(self, e: Emission) -> Text:
-        line = Text(f"{e.t_us / 1e6:9.3f} s  ", style="dim")
+        line = Text(f"{e.t_us / 1e6:9.2f} s ", style="dim")
         line.append(f"{e.n_events:>11,} events  ", style="default")
         if e.prediction is not None:
-            margin = sorted(e.scores, reverse=True)
-            line.append(f"{e.prediction:>12}", style="bold")
-            line.append(f" {margin[0] - margin[1]:+6.2f}  ", style="dim")
+            first, second = sorted(e.scores, reverse=True)[:2]
+            line.append(f"{e.prediction:<10}", style="bold")
+            line.append(f" {first - second:+6.2f}  ", style="dim")
         if e.sample and e.final:
             if e.correct is None:
                 line.append(f"is {e.sample.label}")
+            elif e.correct:
+                line.append("right", style="green")
             else:
-                line.append("right" if e.correct else "wrong", style="green" if e.correct else "red")
-                line.append(f"  is {e.sample.label:<12}")
-                line.append(f"{100 * self._correct / self._samples:6.1f} % of {self._samples}", style="dim")
+                line.append(f"is {e.sample.label}", style="red")
+            if e.labels:
+                line.append(f"  {100 * self._correct / self._samples:.1f} % of {self._samples}", style="dim")
         elif e.prediction is None:
             quadrants = e.features.reshape(4, -1)
-            line.append("energy by quadrant  ", style="dim")
-            line.append("  ".join(f"{float(abs(q).sum()):9.1f}" for q in quadrants))
+            line.append("by quadrant ", style="dim")
+            line.append(" ".join(f"{float(abs(q).sum()):9.1f}" for q in quadrants))
         return line

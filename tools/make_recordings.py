@@ -32,6 +32,9 @@ GAP_US = 1_000_000  # silent, and longer than any window in use, so that no samp
 # Bytes per event of the test recording with zstd: libcaer_cmp 3.9, evt3 4.1, libcaer 4.7, mono 5.5.
 ENCODING = "libcaer_cmp"
 
+# Small, so that the model weighs less than a megabyte; digits of 16 pixels want larger counts than N-CARS.
+LEARN_OPTIONS = ["--filters", "100", "--stride", "2", "--max-count", "2", "--volumes", "10000"]
+
 MODEL, CLASSIFIER, SUMS = "digits.safetensors", "digits_classifier.safetensors", "SHA256SUMS"
 
 
@@ -60,7 +63,7 @@ def learn_models(folder: Path) -> None:
     train, model, classifier = folder / "digits_train.mcap", folder / MODEL, folder / CLASSIFIER
     model.unlink(missing_ok=True)
     classifier.unlink(missing_ok=True)
-    subprocess.run([command, "learn", train, "-o", model], check=True)
+    subprocess.run([command, "learn", train, "-o", model, *LEARN_OPTIONS], check=True)
     subprocess.run([command, "train", train, "-m", model, "-o", classifier], check=True)
 
 

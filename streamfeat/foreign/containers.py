@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from streamfeat.camera_words import Source, checked_resolution, declared_resolution
 from streamfeat.errors import InputError
-from streamfeat.event_tables import checked_events, named_columns, one_line
 from streamfeat.events import Events, Resolution, make_events
+from streamfeat.foreign.tables import checked_events, named_columns, one_line
+from streamfeat.foreign.words import Source, checked_resolution, declared_resolution
 
 __all__ = ["aedat4_resolution", "hdf5_resolution", "read_aedat4", "read_hdf5"]
 

@@ -1,7 +1,7 @@
 """Folders of foreign event files -> labelled samples -> one recording.
 
 Lives here: the folder layouts of data sets, where samples stand in time, and the conversion to MCAP.
-Not here: the formats of single files (`streamfeat.camera_files`) and MCAP itself (`streamfeat.recorder`).
+Not here: the formats of single files (`event_files`) and MCAP itself (`streamfeat.recorder`).
 """
 
 import re
@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from streamfeat.camera_files import EXTENSIONS, open_events
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
+from streamfeat.foreign.event_files import EXTENSIONS, open_events
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label
 

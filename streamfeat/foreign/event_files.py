@@ -1,8 +1,8 @@
 """One foreign event file -> batches of events.
 
 Lives here: which format a file has, its resolution where it says so, and its events, read lazily in batches.
-Not here: the formats themselves (`streamfeat.camera_words`, `streamfeat.camera_containers`,
-`streamfeat.event_tables`), folders and labels (`streamfeat.datasets`), and MCAP (`streamfeat.recording`).
+Not here: the formats themselves (`words`, `containers`, `tables`), folders and labels (`datasets`), and
+MCAP (`streamfeat.recording`).
 """
 
 from collections.abc import Callable, Iterator
@@ -11,8 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.camera_containers import aedat4_resolution, hdf5_resolution, read_aedat4, read_hdf5
-from streamfeat.camera_words import (
+from streamfeat.errors import InputError
+from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.foreign.containers import aedat4_resolution, hdf5_resolution, read_aedat4, read_hdf5
+from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
+from streamfeat.foreign.words import (
     declared_resolution,
     percent_header,
     read_bin40,
@@ -21,9 +24,6 @@ from streamfeat.camera_words import (
     read_evt3,
     start_of_dat,
 )
-from streamfeat.errors import InputError
-from streamfeat.event_tables import HEAD_BYTES, read_numpy, read_text, text_resolution
-from streamfeat.events import EVENT_DTYPE, Events, Resolution
 
 __all__ = ["EXTENSIONS", "FORMATS", "EventFile", "ForeignFile", "open_events", "read_events"]
 

@@ -1,7 +1,7 @@
 """The words that sensors write: `.dat`, 40-bit `.bin`, EVT 2.0 and EVT 3.0, in files of their own.
 
 Lives here: headers of `% key value` lines, and fixed-size records to events, a bounded block at a time.
-Not here: which format a file has (`streamfeat.camera_files`), and packets (`streamfeat.codecs`).
+Not here: which format a file has (`streamfeat.foreign.event_files`), and packets (`streamfeat.codecs`).
 
 Records of fixed size are a few lines of NumPy: 13 to 27 million events a second on two shared cores, where
 packets are written at 2 to 5, so a library would buy nothing. (EVT2: faery 15, eventcv 20, expelliarmus 49;
