@@ -110,6 +110,12 @@ class DictionaryLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self._code(white, self.components_, codes)
         return codes
 
+    def __sklearn_tags__(self) -> Any:
+        """Say that codes are float32 whatever goes in."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        return tags
+
     def _code(
         self, white: NDArray[np.float32], atoms: NDArray[np.float32], codes: NDArray[np.float32]
     ) -> None:

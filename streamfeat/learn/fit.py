@@ -6,7 +6,7 @@ Lives here: the order of the steps and what is written down about them. Not here
 import datetime
 from collections.abc import Callable, Iterable, Sequence
 from statistics import median
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -36,6 +36,8 @@ def bin_length(recordings: Sequence[Recording], n_bins: int, window_ms: float | 
         n_bins: bins in the window.
         window_ms: length of the window.
     """
+    if n_bins < 1:
+        raise InputError(f"{n_bins} bins are not possible; give at least one")
     if window_ms is not None:
         if not 0 < window_ms < 1e9:
             raise InputError(f"a window of {window_ms} ms is not possible")
@@ -74,9 +76,16 @@ def learn_encoder(
     Raises:
         InputError: no usable volume was found, or a parameter is out of range.
     """
+    for name, value, kind in (("formulation", formulation, Formulation), ("encoding", encoding, Encoding)):
+        if value not in get_args(kind):
+            raise InputError(f"{name} is {value!r}, it must be one of {', '.join(get_args(kind))}")
     penalty = THRESHOLDS[formulation] if threshold is None else threshold
-    if n_volumes < 2 or max_iter < 1:
-        raise InputError("at least two volumes and one iteration are needed to learn")
+    if not 0 <= penalty < np.inf or (formulation == "inverse" and penalty == 0):
+        raise InputError(f"threshold is {penalty}, it must be finite and above zero")
+    if n_volumes < 2 or max_iter < 1 or n_filters < 1:
+        raise InputError("at least two volumes, one iteration and one filter are needed to learn")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"seed is {seed}, it must be from 0 to 2^32 - 1")
 
     def windows() -> Iterable[Window]:
         seen = 0

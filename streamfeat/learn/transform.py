@@ -91,7 +91,7 @@ class TransformLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """
         white = validate_data(self, X, dtype=np.float32)
         n, d = white.shape
-        if min(self.threshold, self.conditioning, self.coherence, self.log_det) < 0:
+        if not all(w >= 0 for w in (self.threshold, self.conditioning, self.coherence, self.log_det)):
             raise InputError("threshold, conditioning, coherence and log_det must not be negative")
         if n < 2:
             raise InputError(f"{n} sample is too few to learn from; give at least {d} volumes")
@@ -125,6 +125,12 @@ class TransformLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         white = validate_data(self, X, dtype=np.float32, reset=False)
         z = white @ self.components_.T
         return np.asarray(z - z.clip(-np.float32(self.threshold), np.float32(self.threshold)))
+
+    def __sklearn_tags__(self) -> Any:
+        """Say that codes are float32 whatever goes in."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        return tags
 
     def _second_moment(self, white: NDArray[np.float32]) -> NDArray[np.float64]:
         total = np.zeros((white.shape[1],) * 2)
@@ -171,6 +177,8 @@ class TransformLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         # Between A and B singular values differ by the mean scale of S, which whitening keeps near one.
         scale = float(np.mean(np.square(np.diag(factor))))
         gamma = (sigma + np.sqrt(np.square(sigma) + 8.0 * self.log_det)) / 2.0
+        # Without the determinant's barrier it can be zero, which must not be divided by.
+        gamma = np.maximum(gamma, 1e-100)
         weight = self.coherence / scale
         for _ in range(50):
             slope = gamma - sigma - 2.0 * self.log_det / gamma + weight * gamma * (gamma**2 / scale - 1.0)

@@ -49,7 +49,8 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
     """Cut the items of a recording into windows.
 
     A labelled sample gives one window, which ends with the sample; samples of a held-out split
-    (validation, test) are passed over. Without labels the stream is cut every `window_us`.
+    (validation, test) are passed over. Without labels a window begins with the first event that the one
+    before does not reach, wherever packets end.
 
     Args:
         items: packets and labels in stored order, as `Recording.items` gives them.
@@ -71,14 +72,21 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
             yield from window()
             label, origin = item, item.start_us
         elif len(item.events):
-            first = int(item.events["t"][0])
-            past = label is None and not origin <= first < origin + geometry.window_us
-            if past or item.resolution != resolution:
+            if item.resolution != resolution:
                 yield from window()
                 resolution = item.resolution
-                if label is None:
+            rest = item.events
+            while label is None and len(rest):
+                first = int(rest["t"][0])
+                if not (pending and origin <= first < origin + geometry.window_us):
+                    yield from window()
                     origin = first
-            pending.append(item.events)
+                latest = np.maximum.accumulate(rest["t"])
+                end = int(np.searchsorted(latest, origin + geometry.window_us))
+                pending.append(rest[:end])
+                rest = rest[end:]
+            if len(rest):
+                pending.append(rest)
     yield from window()
 
 

@@ -64,6 +64,12 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             white[start:stop] = (self._normalise(volumes[start:stop]) - self.mean_) @ self.whitening_
         return white
 
+    def __sklearn_tags__(self) -> Any:
+        """Say that what comes out is float32 whatever goes in."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        return tags
+
     def _normalise(self, volumes: NDArray[Any]) -> NDArray[np.float32]:
         values = volumes.astype(np.float32)
         values -= values.mean(axis=1, keepdims=True)
