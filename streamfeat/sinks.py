@@ -19,7 +19,7 @@ from streamfeat.recorder import RecordingWriter
 
 __all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record"]
 
-_LINES_A_SECOND = 8.0
+_LINES_A_SECOND = 4.0
 
 
 class Sink(Protocol):
@@ -149,8 +149,9 @@ class TerminalSink:
             self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
 
     def _line(self, e: Emission) -> Text:
-        line = Text(f"{e.t_us / 1e6:9.2f} s ", style="dim")
-        line.append(f"{e.n_events:>11,} events  ", style="default")
+        line = Text()
+        line.append(f"{e.t_us / 1e6:9.2f} s ", style="dim")
+        line.append(f"{e.n_events:>11,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
             line.append(f"{e.prediction:<10}", style="bold")
