@@ -130,7 +130,7 @@ class Classifier:
         arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
         fingerprint, provenance = header.get("fingerprint"), header.get("provenance", {})
         labels = header["labels"] if isinstance(header.get("labels"), list) else []
-        sound = len(labels) >= 2 and all(isinstance(name, str) for name in labels)
+        sound = all(isinstance(name, str) for name in labels) and len(set(labels)) == len(labels) >= 2
         if not (sound and isinstance(fingerprint, str) and isinstance(provenance, dict)):
             raise InputError(f"{path}: labels, fingerprint or provenance are missing; train it again")
         columns = 1 if len(labels) == 2 else len(labels)
@@ -179,9 +179,11 @@ def train_classifier(
     names, counts = np.unique(np.asarray(labels), return_counts=True)
     if len(names) < 2:
         raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")
+    if folds < 2:
+        raise InputError(f"cross-validation with {folds} folds is not possible; it needs at least two")
     if counts.min() < folds:
         raise InputError(
-            f"label {names[counts.argmin()]!r} has {counts.min()} training samples, "
+            f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
             f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
         )
     pipeline = make_pipeline(FunctionTransformer(normalise_features), StandardScaler(), LinearSVM())
@@ -236,7 +238,8 @@ class OnlineClassifier:
         # The first call only makes scikit-learn allocate; its weights are replaced at once.
         classes = np.arange(len(start.labels))
         self._model.partial_fit(np.zeros((len(classes), len(start.centre))), classes, classes=classes)
-        self._model.coef_ = start.weights.T.astype(np.float64)
+        # Its loops take contiguous rows of float64 only.
+        self._model.coef_ = np.ascontiguousarray(start.weights.T, np.float64)
         self._model.intercept_ = start.bias.astype(np.float64)
 
     def predict_one(self, features: NDArray[np.float32]) -> str:
@@ -266,7 +269,7 @@ class OnlineClassifier:
             return
         rows, targets = zip(*self._pending, strict=True)
         self._pending.clear()
-        self._model.partial_fit(np.stack(rows), np.array(targets))
+        self._model.partial_fit(np.stack(rows).astype(np.float64), np.array(targets))
         self.learned += len(targets)
         old = self.classifier
         self.classifier = Classifier(

@@ -15,8 +15,14 @@ from scipy.optimize import minimize
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 __all__ = ["LinearSVM"]
+
+_WORTH_THREADS = 1 << 24
+"""Multiplications in one matrix product below which BLAS threads cost more than they give. Where another
+program keeps a core busy they wait for each other: 1,797 x 64 with 10 classes took 6.4 s on two and 0.2 s
+on one."""
 
 
 class LinearSVM(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
@@ -69,7 +75,9 @@ class LinearSVM(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
         options = {"maxiter": self.max_iter, "gtol": self.tol, "maxcor": 20}
         start = np.zeros((n_features + 1) * n_problems)
-        found = minimize(objective, start, jac=True, method="L-BFGS-B", options=options)
+        threads = 1 if features.size * n_problems < _WORTH_THREADS else None
+        with threadpool_limits(threads, user_api="blas"):
+            found = minimize(objective, start, jac=True, method="L-BFGS-B", options=options)
         both = found.x.reshape(n_features + 1, n_problems)
         self.coef_, self.intercept_ = both[:-1].T.copy(), both[-1].copy()
         self.n_iter_ = int(found.nit)

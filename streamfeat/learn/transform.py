@@ -34,8 +34,9 @@ class TransformLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     Codes are exact: a soft threshold. The transform is updated through the singular value decomposition
     of `S^-1 X L'` with `X X' + conditioning I = S S'` (Ravishankar and Bresler 2013, section IV-B,
     generalised to `K != d`), each singular value the root of a scalar equation; the coherence term is
-    taken along (Kostadinov et al. 2018, approximate closed form) by keeping the singular vectors. Where
-    that approximation would raise the objective the step is shortened until it does not, so the objective
+    taken along (Kostadinov et al. 2018, approximate closed form) by keeping the singular vectors. For
+    `K < d` the determinant is that of `A S` instead, since only for `K >= d` do the two differ by a constant.
+    Where an approximation would raise the objective the step is shortened until it does not, so the objective
     never rises.
 
     Args:
