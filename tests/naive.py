@@ -1,6 +1,29 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
+import math
+
 import numpy as np
+
+from streamfeat.kernels.layout import (
+    BEFORE_TIME,
+    CLOCK_NOW,
+    CLOCK_ORIGIN,
+    CLOCK_PROJECTED,
+    CLOCK_TOUCHED,
+    FIXED_POINT_ONE,
+    LARGEST_SQUARE,
+    MOMENT_LINEAR,
+    MOMENT_QUADRATIC,
+    MOMENT_SQUARES,
+    MOMENT_SUM,
+    SPLIT,
+    TALLY_EVENTS,
+    TALLY_LATE,
+    TALLY_REJECTED,
+    TALLY_ROLLS,
+    TALLY_SATURATED,
+    TRIANGLE,
+)
 
 # streamfeat.kernels.decode
 
@@ -66,3 +89,311 @@ def _write(events, out):
     for i, event in enumerate(events):
         out[i] = event
     return len(events)
+
+
+# streamfeat.kernels.code
+
+
+def deviation(moments, entries, eps):
+    mean = int(moments[MOMENT_SUM]) / entries
+    return math.sqrt(int(moments[MOMENT_SQUARES]) / entries - mean * mean + eps)
+
+
+def whitened_square(moments, sigma, operator):
+    quadratic = float(moments[MOMENT_QUADRATIC]) * operator.quadratic_scale / (sigma * sigma)
+    linear = float(moments[MOMENT_LINEAR]) * operator.linear_scale / sigma
+    return float(np.clip(quadratic - 2 * linear + operator.constant, 0, LARGEST_SQUARE))
+
+
+def _scores(projection, sigma, operator):
+    gain = np.float32(operator.scale * FIXED_POINT_ONE / sigma)
+    return projection.astype(np.float32) * gain - operator.offset
+
+
+def soft_code(projection, sigma, operator, code):
+    z = _scores(projection, sigma, operator)
+    code[:] = np.sign(z) * np.maximum(np.abs(z) - np.float32(operator.threshold), np.float32(0))
+
+
+def triangle_code(projection, sigma, square, operator, code):
+    k = operator.n_filters
+    one = np.float32(FIXED_POINT_ONE)
+    z = _scores(projection, sigma, operator)[:k] / one
+    squares = np.float32(square) - np.float32(2) * z + operator.square_norms[:k]
+    distances = (np.sqrt(np.maximum(squares, np.float32(0))) * one).astype(np.int64)
+    code[:] = 0
+    code[:k] = np.maximum(distances.sum() // k - distances, 0)
+
+
+def pool(code, sign, kind, pooled):
+    code = code.astype(np.int64)
+    parts = [code.clip(0), (-code).clip(0)] if kind == SPLIT else [code]
+    pooled += sign * np.concatenate(parts)
+
+
+# streamfeat.kernels.ingest
+
+
+def advance_to_bin(new, state):
+    n_bins, now = len(state.counts), int(state.clock[CLOCK_NOW])
+    if new <= now:
+        return
+    before = set(range(now - n_bins + 1, now + 1))
+    for bin_index in set(range(new - n_bins + 1, new + 1)) - before:
+        state.counts[bin_index % n_bins] = 0
+    if now != BEFORE_TIME:
+        state.tally[TALLY_ROLLS] += new - now
+    state.clock[CLOCK_NOW] = new
+
+
+def count_events(events, height, width, operator, state):
+    counts, clock, tally = state.counts, state.clock, state.tally
+    n_bins, limit = len(counts), operator.max_count
+    for x, y, p, t in events.tolist():
+        if not (x < width and y < height and p in (0, 1) and abs(t) < 2**62):
+            tally[TALLY_REJECTED] += 1
+            continue
+        bin_index = (t - int(clock[CLOCK_ORIGIN])) // operator.bin_us
+        advance_to_bin(bin_index, state)
+        if bin_index not in range(clock[CLOCK_NOW] - n_bins + 1, clock[CLOCK_NOW] + 1):
+            tally[TALLY_LATE] += 1
+            continue
+        tally[TALLY_EVENTS] += 1
+        entry = bin_index % n_bins, y // operator.downsample, x // operator.downsample
+        before = np.clip(counts[entry], -limit, limit)
+        counts[entry] += {0: -1, 1: 1}[p]
+        if np.clip(counts[entry], -limit, limit) == before:
+            tally[TALLY_SATURATED] += 1
+        elif not state.is_touched[entry]:
+            state.is_touched[entry] = 1
+            state.touched[clock[CLOCK_TOUCHED]] = np.ravel_multi_index(entry, counts.shape)
+            clock[CLOCK_TOUCHED] += 1
+
+
+# streamfeat.kernels.lasso
+
+
+def duality_gap(residual, right, atoms, square, penalty):
+    # With r = x - D l, from primal less dual: 1/2 |r|^2 + lambda |l|_1 - (1/2 |x|^2 - 1/2 |x - s r|^2).
+    from_x = square - right @ atoms  # x . r
+    rest = max(from_x - residual @ atoms, 0.0)  # |r|^2
+    from_x = rest + residual @ atoms
+    s = min(1.0, penalty / np.abs(residual).max()) if residual.any() else 1.0
+    return rest / 2 + penalty * np.abs(atoms).sum() - (s * from_x - s * s * rest / 2)
+
+
+def lasso_objective(right, square, penalty, gram, atoms):
+    return square / 2 - right @ atoms + atoms @ gram @ atoms / 2 + penalty * np.abs(atoms).sum()
+
+
+def _shrunken_gradient_steps(right, penalty, gram, atoms):
+    """Proximal gradient descent (ISTA) until nothing moves: slow, and sure to arrive."""
+    lipschitz = max(float(np.linalg.eigvalsh(gram).max()), 1e-12) if len(gram) else 1.0
+    for _ in range(20_000):
+        z = atoms + (right - gram @ atoms) / lipschitz
+        following = np.sign(z) * np.maximum(np.abs(z) - penalty / lipschitz, 0)
+        following[np.diag(gram) == 0] = atoms[np.diag(gram) == 0]
+        if np.abs(following - atoms).max(initial=0) < 1e-13:
+            return following
+        atoms = following
+    return atoms
+
+
+def solve_lasso(right, square, penalty, gram, gap, start, atoms, residual, active):
+    gram = gram.astype(np.float64)
+    atoms[:] = _shrunken_gradient_steps(right, penalty, gram, start.astype(np.float64))
+    residual[:] = right - gram @ atoms
+    return duality_gap(residual, right, atoms, square, penalty) / max(square / 2, 1e-300)
+
+
+def descend(active, penalty, gram, tolerance, atoms, residual):
+    part = gram[np.ix_(active, active)].astype(np.float64)
+    right = residual[active] + part @ atoms[active]
+    atoms[active] = _shrunken_gradient_steps(right, penalty, part, atoms[active])
+    residual[active] = right - part @ atoms[active]
+
+
+def lasso_code(projection, sigma, square, operator, atoms, work, active):
+    k = len(atoms)
+    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+    solution, residual = np.zeros(k), np.zeros(k)
+    penalty = operator.threshold / FIXED_POINT_ONE
+    solve_lasso(right, square, penalty, operator.gram, operator.gap, atoms, solution, residual, None)
+    atoms[:] = solution
+
+
+def fix_atoms(atoms, code):
+    code[:] = 0
+    code[: len(atoms)] = np.trunc((atoms.astype(np.float64) * FIXED_POINT_ONE).clip(-(2**31 - 1), 2**31 - 1))
+
+
+def solve_lasso_rows(right, squares, penalty, gram, gap, codes):
+    for b, square, code in zip(right.astype(np.float64), squares, codes, strict=True):
+        atoms, residual = np.zeros(len(b)), np.zeros(len(b))
+        solve_lasso(b, square, penalty, gram, gap, code, atoms, residual, None)
+        code[:] = atoms
+
+
+# streamfeat.kernels.volume
+
+
+def add_column(change, column, projection):
+    projection += change * column.astype(np.int32)
+
+
+def gather_volume(ring, first_slot, top, left, patch, values):
+    oldest_first = np.roll(ring, -first_slot, axis=0)
+    values[:] = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
+    return np.count_nonzero(values)
+
+
+def project_volume(values, operator, projection, moments):
+    v = values.astype(np.int64)
+    projection[:] = v @ operator.columns.astype(np.int64)
+    moments[:] = 0
+    moments[MOMENT_SUM], moments[MOMENT_SQUARES] = v.sum(), v @ v
+    if operator.quadratic.size:
+        moments[MOMENT_QUADRATIC] = v @ operator.quadratic.astype(np.int64) @ v
+        moments[MOMENT_LINEAR] = v @ operator.linear.astype(np.int64)
+
+
+def change_entry(entry, before, after, values, operator, projection, moments):
+    projections, sums = np.zeros((2, len(projection)), np.int32), np.zeros((2, 4), np.int64)
+    for i, count in enumerate((before, after)):
+        volume = values.copy()
+        volume[entry] = count
+        project_volume(volume, operator, projections[i], sums[i])
+    projection += projections[1] - projections[0]
+    moments += sums[1] - sums[0]
+
+
+# streamfeat.kernels.update
+
+
+def quadrant(volume, rows, columns):
+    row, column = divmod(volume, columns)
+    is_low, is_right = row >= rows / 2, column >= columns / 2
+    return [[0, 1], [2, 3]][is_low][is_right]
+
+
+def covering(pixel, count, operator):
+    starts = np.arange(count) * operator.stride
+    volumes = np.flatnonzero((starts <= pixel) & (pixel < starts + operator.patch))
+    return (volumes[0], volumes[-1] + 1) if len(volumes) else (0, 0)
+
+
+def encode_volume(projection, moments, atoms, fresh, operator, state):
+    if moments[MOMENT_SQUARES] == 0:
+        state.code[:] = 0
+        if fresh:
+            atoms[:] = 0
+        return
+    sigma = deviation(moments, len(operator.columns), operator.eps)
+    square = whitened_square(moments, sigma, operator)
+    if operator.inverse:
+        if fresh:
+            lasso_code(projection, sigma, square, operator, atoms, None, None)
+        fix_atoms(atoms, state.code)
+    elif operator.kind == TRIANGLE:
+        triangle_code(projection, sigma, square, operator, state.code)
+    else:
+        soft_code(projection, sigma, operator, state.code)
+
+
+def pool_volume(volume, sign, shape, operator, state):
+    projection, moments, atoms = state.projections[volume], state.moments[volume], state.atoms[volume]
+    encode_volume(projection, moments, atoms, sign > 0, operator, state)
+    pool(state.code, sign, operator.kind, state.pooled[quadrant(volume, *shape)])
+
+
+def encode_ring(ring, first_slot, shape, operator, state):
+    state.pooled[:] = 0
+    filled = 0
+    for volume, (r, c) in enumerate(np.ndindex(*shape)):
+        kept = volume if len(state.projections) > 1 else 0
+        projection, moments, atoms = state.projections[kept], state.moments[kept], state.atoms[kept]
+        top, left = r * operator.stride, c * operator.stride
+        filled += gather_volume(ring, first_slot, top, left, operator.patch, state.values) > 0
+        project_volume(state.values, operator, projection, moments)
+        encode_volume(projection, moments, atoms, True, operator, state)
+        pool(state.code, 1, operator.kind, state.pooled[quadrant(volume, *shape)])
+    return filled
+
+
+def rebuild(shape, operator, state):
+    state.is_touched[:] = 0
+    state.applied[:] = state.counts.clip(-operator.max_count, operator.max_count)
+    state.clock[CLOCK_TOUCHED] = 0
+    state.clock[CLOCK_PROJECTED] = state.clock[CLOCK_NOW]
+    first_slot = (int(state.clock[CLOCK_NOW]) + 1) % len(state.counts)
+    return encode_ring(state.applied, first_slot, shape, operator, state)
+
+
+def apply_touched(shape, operator, state):
+    changed = state.counts.clip(-operator.max_count, operator.max_count) != state.applied
+    dirty = 0
+    for r, c in np.ndindex(*shape):
+        top, left = r * operator.stride, c * operator.stride
+        dirty += changed[:, top : top + operator.patch, left : left + operator.patch].any()
+    rebuild(shape, operator, state)
+    return dirty
+
+
+def update(shape, operator, state):
+    is_current = state.clock[CLOCK_PROJECTED] == state.clock[CLOCK_NOW]
+    return apply_touched(shape, operator, state) if is_current else rebuild(shape, operator, state)
+
+
+# The mathematics itself, in float64 and without a quantised operator: what all of the above is for.
+
+
+def window_counts(events, geometry, resolution, origin_us, t_us):
+    """Clipped counts `(n_bins, H, W)` of the window that ends with the bin of `t_us`, oldest bin first."""
+    counts = np.zeros((geometry.n_bins, *geometry.ring_shape(resolution)), int)
+    first = (t_us - origin_us) // geometry.bin_us - geometry.n_bins + 1
+    for x, y, p, t in events.tolist():
+        position = (t - origin_us) // geometry.bin_us - first
+        inside = x < resolution[1] and y < resolution[0] and p in (0, 1)
+        if inside and 0 <= position < geometry.n_bins:
+            counts[position, y // geometry.downsample, x // geometry.downsample] += 2 * p - 1
+    return counts.clip(-geometry.max_count, geometry.max_count)
+
+
+def local_volumes(counts, geometry):
+    """`(rows, columns, d)` local volumes of a ring of counts."""
+    patch = geometry.patch
+    tops, lefts = (range(0, side - patch + 1, geometry.stride) for side in counts.shape[1:])
+    blocks = [[counts[:, i : i + patch, j : j + patch].reshape(-1) for j in lefts] for i in tops]
+    return np.array(blocks, np.float64)
+
+
+def code_of(volume, encoder):
+    """Code `(K,)` of one local volume, straight from the filters, the whitening and the mean."""
+    filters, whitening, mean = (
+        a.astype(np.float64) for a in (encoder.filters, encoder.whitening, encoder.mean)
+    )
+    if not volume.any():
+        return np.zeros(len(filters))
+    x = whitening @ ((volume - volume.mean()) / np.sqrt(volume.var() + encoder.operator.eps) - mean)
+    if encoder.encoding == "triangle":
+        distances = np.linalg.norm(x - filters, axis=1)
+        return np.maximum(0, distances.mean() - distances)
+    if encoder.formulation == "inverse":
+        start = np.zeros(len(filters))
+        return _shrunken_gradient_steps(filters @ x, encoder.threshold, filters @ filters.T, start)
+    z = filters @ x
+    return np.sign(z) * np.maximum(np.abs(z) - encoder.threshold, 0)
+
+
+def codes_of(counts, encoder):
+    """`(rows, columns, K)` codes of a ring of counts."""
+    return np.apply_along_axis(code_of, 2, local_volumes(counts, encoder.geometry), encoder)
+
+
+def features_from(codes, encoding):
+    """Codes summed over the four quadrants; positive and negative parts apart for `split`."""
+    if encoding == "split":
+        codes = np.concatenate([codes.clip(0), (-codes).clip(0)], axis=2)
+    rows, columns = ((side + 1) // 2 for side in codes.shape[:2])
+    quadrants = codes[:rows, :columns], codes[:rows, columns:], codes[rows:, :columns], codes[rows:, columns:]
+    return np.concatenate([q.sum(axis=(0, 1)) for q in quadrants])

@@ -1,0 +1,468 @@
+"""One row for each compiled kernel: how to make arguments for it, and how its results compare.
+
+The tests run every row against the twin of the same name in `naive`; benchmarks time the same rows.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import naive
+import numpy as np
+from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random_events
+
+from streamfeat.engine import Engine
+from streamfeat.events import EVENT_DTYPE
+from streamfeat.geometry import Geometry
+from streamfeat.kernels import code, decode, ingest, lasso, update, volume
+from streamfeat.kernels.layout import CLOCK_NOW, FIXED_POINT_ONE, Operator, State
+
+SCRATCH = {"touched", "dirty", "code", "work", "active", "values"}
+"""Fields of a State whose content means nothing between two calls."""
+
+
+def copied(value):
+    """A copy of what a kernel may change; an operator is frozen and stays itself."""
+    if isinstance(value, State):
+        return State(*(field.copy() for field in value))
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def assert_same(kernel, twin, *, scratch=frozenset(), name="result"):
+    if isinstance(kernel, Operator):
+        return
+    if isinstance(kernel, State):
+        for field in State._fields:
+            if field not in scratch:
+                assert_same(getattr(kernel, field), getattr(twin, field), name=field)
+    elif isinstance(kernel, np.ndarray):
+        np.testing.assert_array_equal(kernel, twin, err_msg=name, strict=True)
+    else:
+        assert kernel == twin, name
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a function was given, what it became, and what was returned."""
+
+    before: tuple[Any, ...]
+    after: tuple[Any, ...]
+    result: Any
+
+
+def exact(kernel: Run, twin: Run) -> None:
+    assert_same(kernel.result, twin.result)
+    for mine, yours in zip(kernel.after, twin.after, strict=True):
+        assert_same(mine, yours)
+
+
+def exact_but_scratch(kernel: Run, twin: Run) -> None:
+    assert_same(kernel.result, twin.result)
+    for mine, yours in zip(kernel.after, twin.after, strict=True):
+        assert_same(mine, yours, scratch=SCRATCH)
+
+
+def exact_but_atoms(kernel: Run, twin: Run) -> None:
+    """As above; lasso codes are each within the gap, and what was pooled is what they are."""
+    operator, state = kernel.after[-2:]
+    if not operator.inverse:
+        return exact_but_scratch(kernel, twin)
+    assert_same(kernel.result, twin.result)
+    assert_same(state, twin.after[-1], scratch=SCRATCH | {"atoms", "pooled"})
+    assert_certified(operator, state)
+    shape = kernel.before[-3]
+    if len(state.atoms) > 1:
+        pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code)
+        for v, atoms in enumerate(state.atoms):
+            naive.fix_atoms(atoms, fixed)
+            naive.pool(fixed, 1, operator.kind, pooled[naive.quadrant(v, *shape)])
+        np.testing.assert_array_equal(state.pooled, pooled)
+    return None
+
+
+def assert_certified(operator, state):
+    """Each volume's atoms solve its lasso within the relative duality gap of the operator."""
+    for projection, moments, atoms in zip(state.projections, state.moments, state.atoms, strict=True):
+        if not moments[1]:
+            assert not atoms.any()
+            continue
+        sigma = naive.deviation(moments, len(operator.columns), operator.eps)
+        square = naive.whitened_square(moments, sigma, operator)
+        k = len(atoms)
+        right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+        residual = right - operator.gram.astype(np.float64) @ atoms
+        penalty = operator.threshold / FIXED_POINT_ONE
+        gap = naive.duality_gap(residual, right, atoms.astype(np.float64), square, penalty)
+        assert gap <= operator.gap * square / 2 + float32_slack(operator, atoms, square)
+
+
+def float32_slack(operator, atoms, square):
+    """What keeping a solution in float32 can add to its duality gap.
+
+    An atom is off by at most `u |l_k|` with `u = 2^-24`, so each correlation of the residual by at most
+    `e = u max_j sum_k |G_jk| |l_k|`. The primal objective changes by less than `2 (lambda + e) u |l|_1`; the
+    factor that makes the residual feasible by less than `e / lambda`, and with it the dual objective by less
+    than `(e / lambda) 2 |x|^2`.
+    """
+    unit, penalty = 2.0**-24, operator.threshold / FIXED_POINT_ONE
+    error = unit * (np.abs(operator.gram.astype(np.float64)) @ np.abs(atoms)).max()
+    return 2 * (penalty + error) * unit * np.abs(atoms).sum() + 2 * square * error / penalty
+
+
+def exact_unless_refused(kernel: Run, twin: Run) -> None:
+    """Words of an unknown type end a packet: what was written before that means nothing."""
+    assert_same(kernel.result, twin.result)
+    if kernel.result >= 0:
+        exact(kernel, twin)
+
+
+def same_range(kernel: Run, twin: Run) -> None:
+    assert range(*kernel.result) == range(*twin.result)
+
+
+def close(kernel: Run, twin: Run) -> None:
+    square = kernel.before[3]
+    assert abs(kernel.result - twin.result) <= 1e-12 * square
+
+
+def lasso_within_gap(kernel: Run, twin: Run) -> None:
+    right, square, penalty, gram, gap = kernel.before[:5]
+    (mine, yours) = (naive.lasso_objective(right, square, penalty, gram, r.after[6]) for r in (kernel, twin))
+    assert kernel.result <= gap
+    assert abs(mine - yours) <= gap * square / 2 + 1e-12 * square
+    np.testing.assert_allclose(kernel.after[7], right - gram.astype(float) @ kernel.after[6], atol=1e-9)
+
+
+def rows_within_gap(kernel: Run, twin: Run) -> None:
+    right, squares, penalty, gram, gap, _ = kernel.before
+    for b, square, mine, yours in zip(right, squares, kernel.after[5], twin.after[5], strict=True):
+        parts = [naive.lasso_objective(b.astype(float), square, penalty, gram, a) for a in (mine, yours)]
+        assert abs(parts[0] - parts[1]) <= gap * square / 2 + 1e-6 * square
+
+
+def descended(kernel: Run, twin: Run) -> None:
+    active, penalty, gram, tolerance, atoms, residual = kernel.before
+    part = gram[np.ix_(active, active)].astype(float)
+    right = residual[active] + part @ atoms[active]
+    reached = [naive.lasso_objective(right, 0, penalty, part, r.after[4][active]) for r in (kernel, twin)]
+    assert reached[0] - reached[1] <= tolerance + 1e-9
+    mine, my_residual = kernel.after[4], kernel.after[5]
+    np.testing.assert_allclose(my_residual[active], right - part @ mine[active], atol=1e-9)
+    rest = np.setdiff1d(np.arange(len(atoms)), active)
+    np.testing.assert_array_equal(mine[rest], atoms[rest])
+
+
+def lasso_code_within_gap(kernel: Run, twin: Run) -> None:
+    projection, sigma, square, operator, *_ = kernel.before
+    k, penalty = operator.n_filters, operator.threshold / FIXED_POINT_ONE
+    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+    mine, yours = (
+        naive.lasso_objective(right, square, penalty, operator.gram, run.after[4].astype(float))
+        for run in (kernel, twin)
+    )
+    slack = float32_slack(operator, kernel.after[4], square) + float32_slack(operator, twin.after[4], square)
+    assert abs(mine - yours) <= operator.gap * square / 2 + slack
+
+
+# Random arguments. Each maker takes a generator and returns the arguments of one call.
+
+
+def pick(rng, options):
+    return options[rng.integers(len(options))]
+
+
+def random_engine(rng, kinds=KINDS):
+    """A small engine with events in all of its window, read at some moment or never."""
+    geometry = Geometry(
+        patch=int(rng.integers(1, 5)),
+        stride=int(rng.integers(1, 6)),
+        n_bins=int(rng.integers(1, 5)),
+        bin_us=int(pick(rng, [1, 7, 1000])),
+        downsample=int(rng.integers(1, 4)),
+        max_count=int(pick(rng, [1, 2, 3, 1000])),
+    )
+    if geometry.entries == 1:
+        geometry = Geometry(patch=2, stride=1, n_bins=1, bin_us=10)
+    smallest = geometry.patch * geometry.downsample
+    resolution = (int(smallest + rng.integers(0, 12)), int(smallest + rng.integers(0, 12)))
+    formulation, encoding = pick(rng, kinds)
+    threshold = float(pick(rng, [0.02, 0.3]))
+    n_filters = int(pick(rng, [1, 5, 32, 33]))
+    encoder = random_encoder(rng, geometry, n_filters, formulation, encoding, threshold=threshold)
+    engine = Engine(encoder, resolution, origin_us=int(rng.integers(-2000, 2000)))
+    engine.feed(random_events(rng, geometry, resolution, int(rng.integers(0, 200))))
+    return engine
+
+
+def read_engine(rng, kinds=KINDS, *, more=0):
+    """A random engine whose sums are current, with `more` events counted since, none in a new bin."""
+    engine = random_engine(rng, kinds)
+    engine.advance(0)
+    engine.features()
+    events = random_events(rng, engine.encoder.geometry, engine.resolution, more)
+    now_us = (int(engine._state.clock[CLOCK_NOW]) + 1) * engine.encoder.geometry.bin_us - 1
+    events["t"] = np.minimum(events["t"], now_us + int(engine._state.clock[3]))
+    engine.feed(events)
+    return engine
+
+
+def parts_of(engine):
+    return engine.grid_shape, engine.encoder.operator, copied(engine._state)
+
+
+def random_values(rng, operator):
+    limit, d = operator.max_count, len(operator.columns)
+    values = rng.integers(-limit, limit + 1, d).astype(np.int16)
+    values[rng.random(d) < rng.random()] = 0
+    return values
+
+
+def random_volume(rng, kinds=KINDS):
+    """An operator and the projection and moments of one random volume that is not empty."""
+    operator = random_engine(rng, kinds).encoder.operator
+    values = random_values(rng, operator)
+    values[0] = values[0] or 1
+    projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
+    naive.project_volume(values, operator, projection, moments)
+    return operator, projection, moments
+
+
+def random_code(rng, width):
+    return rng.integers(-(2**20), 2**20, width).astype(np.int32)
+
+
+def make_deviation(rng):
+    operator, _, moments = random_volume(rng)
+    return moments, len(operator.columns), operator.eps
+
+
+def make_whitened_square(rng):
+    operator, _, moments = random_volume(rng, [("direct", "triangle"), ("inverse", "soft")])
+    return moments, naive.deviation(moments, len(operator.columns), operator.eps), operator
+
+
+def make_soft_code(rng):
+    operator, projection, moments = random_volume(rng)
+    sigma = naive.deviation(moments, len(operator.columns), operator.eps)
+    return projection, sigma, operator, random_code(rng, len(projection))
+
+
+def make_triangle_code(rng):
+    operator, projection, moments = random_volume(rng, [("direct", "triangle")])
+    sigma = naive.deviation(moments, len(operator.columns), operator.eps)
+    square = naive.whitened_square(moments, sigma, operator)
+    return projection, sigma, square, operator, random_code(rng, len(projection))
+
+
+def make_pool(rng):
+    kind, width = int(rng.integers(0, 3)), int(pick(rng, [32, 64]))
+    pooled = rng.integers(-(2**40), 2**40, 2 * width if kind == 1 else width)
+    return random_code(rng, width), int(pick(rng, [-1, 1])), kind, pooled
+
+
+def make_evt3(rng):
+    words = random_words(rng, [0, 2, 2, 3, 4, 5, 6, 8, 10])
+    return words, np.zeros(6, np.int64), np.zeros(12 * len(words), EVENT_DTYPE)
+
+
+def make_libcaer_cmp(rng):
+    words = random_words(rng, [0, 1, 2, 3, 3, 4, 5] + [6] * (rng.random() < 0.1))
+    return words, int(rng.integers(0, 2**50)), np.zeros(3, np.int64), np.zeros(8 * len(words), EVENT_DTYPE)
+
+
+def random_words(rng, kinds):
+    n = int(rng.integers(0, 80))
+    return (rng.choice(kinds, n) << 12 | rng.integers(0, 4096, n)).astype(np.uint16)
+
+
+def make_advance_to_bin(rng):
+    _, _, state = parts_of(random_engine(rng))
+    return max(int(state.clock[CLOCK_NOW]), -5000) + int(rng.integers(-2, 8)), state
+
+
+def make_count_events(rng):
+    engine = random_engine(rng)
+    events = random_events(rng, engine.encoder.geometry, engine.resolution, 100, n_windows=6)
+    hostile = rng.random(100) < 0.05
+    events["t"][hostile] = rng.choice([-(2**63), 2**63 - 1, 2**62, -(2**62)], hostile.sum())
+    events["p"][rng.random(100) < 0.05] = rng.choice([-1, 2, 32767, -32768])
+    events["x"][rng.random(100) < 0.05] = 65535
+    _, operator, state = parts_of(engine)
+    return events, *engine.resolution, operator, state
+
+
+def lasso_problem(rng):
+    """`D`, `x` with more entries than atoms, so that the slow twin arrives as well."""
+    k = int(rng.integers(1, 12))
+    atoms, x = rng.normal(size=(k, 3 * k)) / np.sqrt(3 * k), 2 * rng.normal(size=3 * k)
+    gram = (atoms @ atoms.T).astype(np.float32)
+    start = (rng.normal(size=k) * (rng.random(k) < 0.5)).astype(np.float32)
+    return atoms @ x, float(x @ x), gram, start
+
+
+def frozen(array):
+    array.flags.writeable = False
+    return array
+
+
+def make_duality_gap(rng):
+    right, square, gram, start = lasso_problem(rng)
+    atoms = start.astype(np.float64)
+    return right - gram.astype(np.float64) @ atoms, right, atoms, square, 0.1
+
+
+def make_solve_lasso(rng):
+    right, square, gram, start = lasso_problem(rng)
+    k = len(right)
+    scratch = np.zeros(k), np.zeros(k), np.zeros(k, np.int64)
+    return right, square, float(pick(rng, [0.05, 0.5])), frozen(gram), 1e-8, start, *scratch
+
+
+def make_descend(rng):
+    right, _, gram, start = lasso_problem(rng)
+    atoms = start.astype(np.float64)
+    active = np.flatnonzero(rng.random(len(right)) < 0.6)
+    return active, 0.1, frozen(gram), 1e-8, atoms, right - gram.astype(np.float64) @ atoms
+
+
+def make_lasso_code(rng):
+    operator, projection, moments = random_volume(rng, LASSO_KINDS)
+    sigma = naive.deviation(moments, len(operator.columns), operator.eps)
+    square = naive.whitened_square(moments, sigma, operator)
+    start = rng.normal(size=operator.n_filters).astype(np.float32)
+    padded = len(projection)
+    return projection, sigma, square, operator, start, np.zeros((4, padded)), np.zeros(padded, np.int64)
+
+
+def make_fix_atoms(rng):
+    k, scale = int(rng.integers(1, 33)), pick(rng, [1, 1e9])
+    return (scale * rng.normal(size=k)).astype(np.float32), random_code(rng, 32)
+
+
+def make_solve_lasso_rows(rng):
+    right, _, gram, _ = lasso_problem(rng)
+    k, n = len(right), int(rng.integers(1, 9))
+    rights, codes = rng.normal(size=(n, k)).astype(np.float32), rng.normal(size=(n, k)).astype(np.float32)
+    # Any right is D'x of some x; the shortest has this square, a longer one only moves the objective.
+    inverse = np.linalg.inv(gram.astype(np.float64))
+    squares = 1.1 * np.einsum("ni,ij,nj->n", rights, inverse, rights)
+    return rights, squares, 0.2, gram, GAP, codes
+
+
+def make_quadrant(rng):
+    rows, columns = (int(side) for side in rng.integers(1, 9, 2))
+    return int(rng.integers(0, rows * columns)), rows, columns
+
+
+def make_covering(rng):
+    return int(rng.integers(0, 30)), int(rng.integers(1, 8)), random_engine(rng).encoder.operator
+
+
+def make_encode_volume(rng):
+    _, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    v = int(rng.integers(0, len(state.projections)))
+    rows = (field[v].copy() for field in (state.projections, state.moments, state.atoms))
+    return *rows, bool(rng.random() < 0.5), operator, state
+
+
+def make_pool_volume(rng):
+    shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    return int(rng.integers(0, shape[0] * shape[1])), int(pick(rng, [-1, 1])), shape, operator, state
+
+
+def make_update(rng):
+    engine = random_engine(rng) if rng.random() < 0.5 else read_engine(rng, more=40)
+    return parts_of(engine)
+
+
+def make_rebuild(rng):
+    return parts_of(random_engine(rng))
+
+
+def make_apply_touched(rng):
+    return parts_of(read_engine(rng, more=40))
+
+
+def make_encode_ring(rng):
+    shape, operator, state = parts_of(read_engine(rng))
+    if rng.random() < 0.5:  # what an offline window is encoded in
+        state = state._replace(
+            projections=state.projections[:1], moments=state.moments[:1], atoms=state.atoms[:1]
+        )
+    ring = copied(state.applied)
+    return ring, int(rng.integers(0, len(ring))), shape, operator, state
+
+
+def make_add_column(rng):
+    column = rng.integers(-32767, 32768, 32).astype(np.int16)
+    return np.int32(rng.integers(-100, 101)), frozen(column), random_code(rng, 32)
+
+
+def make_change_entry(rng):
+    operator, projection, moments = random_volume(rng)
+    values = random_values(rng, operator)
+    entry, after = int(rng.integers(0, len(values))), int(rng.integers(-1, 2)) * operator.max_count
+    return entry, int(values[entry]), after, values, operator, projection, moments
+
+
+def make_gather_volume(rng):
+    operator = random_engine(rng).encoder.operator
+    patch, values = operator.patch, random_values(rng, operator)
+    n_bins = len(values) // patch**2
+    height, width = (patch + int(more) for more in rng.integers(0, 6, 2))
+    ring = rng.integers(-2, 3, (n_bins, height, width)).astype(np.int16)
+    top, left = int(rng.integers(0, height - patch + 1)), int(rng.integers(0, width - patch + 1))
+    return ring, int(rng.integers(0, n_bins)), top, left, patch, values
+
+
+def make_project_volume(rng):
+    operator, projection, moments = random_volume(rng)
+    return random_values(rng, operator), operator, projection, moments
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kernel, a maker of random arguments, and the meaning of "the same result"."""
+
+    kernel: Callable[..., Any]
+    make: Callable[[np.random.Generator], tuple[Any, ...]]
+    agree: Callable[[Run, Run], None] = exact
+
+    @property
+    def name(self) -> str:
+        return self.kernel.__name__
+
+    @property
+    def twin(self) -> Callable[..., Any]:
+        return getattr(naive, self.name)
+
+
+KERNELS = [
+    Row(code.deviation, make_deviation),
+    Row(code.whitened_square, make_whitened_square),
+    Row(code.soft_code, make_soft_code),
+    Row(code.triangle_code, make_triangle_code),
+    Row(code.pool, make_pool),
+    Row(decode.decode_evt3, make_evt3),
+    Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
+    Row(ingest.advance_to_bin, make_advance_to_bin),
+    Row(ingest.count_events, make_count_events),
+    Row(lasso.duality_gap, make_duality_gap, close),
+    Row(lasso.solve_lasso, make_solve_lasso, lasso_within_gap),
+    Row(lasso.descend, make_descend, descended),
+    Row(lasso.lasso_code, make_lasso_code, lasso_code_within_gap),
+    Row(lasso.fix_atoms, make_fix_atoms),
+    Row(lasso.solve_lasso_rows, make_solve_lasso_rows, rows_within_gap),
+    Row(update.quadrant, make_quadrant),
+    Row(update.covering, make_covering, same_range),
+    Row(update.encode_volume, make_encode_volume),
+    Row(update.pool_volume, make_pool_volume, exact_but_scratch),
+    Row(update.update, make_update, exact_but_atoms),
+    Row(update.rebuild, make_rebuild, exact_but_atoms),
+    Row(update.encode_ring, make_encode_ring, exact_but_atoms),
+    Row(update.apply_touched, make_apply_touched, exact_but_atoms),
+    Row(volume.add_column, make_add_column),
+    Row(volume.change_entry, make_change_entry),
+    Row(volume.gather_volume, make_gather_volume),
+    Row(volume.project_volume, make_project_volume),
+]

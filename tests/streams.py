@@ -1,0 +1,159 @@
+"""Random encoders and event streams, and one stream fed in every way a stream can be cut."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
+from streamfeat.events import make_events
+from streamfeat.geometry import Geometry
+
+KINDS = [(f, e) for f in ("direct", "inverse") for e in ("soft", "split", "triangle")]
+"""Every formulation with every encoding."""
+
+EXACT_KINDS = [kind for kind in KINDS if kind[0] == "direct" or kind[1] == "triangle"]
+LASSO_KINDS = [kind for kind in KINDS if kind not in EXACT_KINDS]
+
+GAP = 1e-6
+
+
+def random_encoder(rng, geometry, n_filters, formulation="direct", encoding="soft", **parameters):
+    """An encoder like a learned one: filters of about unit length, whitening near the identity."""
+    d = geometry.entries
+    whitening = np.eye(d) + 0.2 / np.sqrt(d) * rng.normal(size=(d, d))
+    parameters = {"threshold": 0.1, "gap": GAP} | parameters
+    return Encoder.build(
+        geometry,
+        formulation=formulation,
+        encoding=encoding,
+        filters=rng.normal(size=(n_filters, d)) / np.sqrt(d),
+        whitening=(whitening + whitening.T) / 2,
+        mean=0.1 * rng.normal(size=d),
+        **parameters,
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sensor and an encoder, small enough to be seen whole."""
+
+    geometry: Geometry
+    resolution: tuple[int, int]
+    n_filters: int
+    formulation: str
+    encoding: str
+    threshold: float
+    seed: int
+
+    @cached_property
+    def encoder(self):
+        rng = np.random.default_rng(self.seed)
+        return random_encoder(
+            rng, self.geometry, self.n_filters, self.formulation, self.encoding, threshold=self.threshold
+        )
+
+    def engine(self, origin_us=0):
+        return Engine(self.encoder, self.resolution, origin_us=origin_us)
+
+
+@st.composite
+def cases(draw, kind, max_bins=4):
+    formulation, encoding = kind
+    geometry = Geometry(
+        patch=draw(st.integers(1, 4)),
+        stride=draw(st.integers(1, 5)),
+        n_bins=draw(st.integers(1, max_bins)),
+        bin_us=draw(st.sampled_from([1, 7, 1000])),
+        downsample=draw(st.integers(1, 3)),
+        max_count=draw(st.sampled_from([1, 2, 3, 100])),
+    )
+    smallest = geometry.patch * geometry.downsample
+    side = st.integers(smallest, smallest + 11)
+    return Case(
+        geometry,
+        (draw(side), draw(side)),
+        draw(st.sampled_from([1, 5, 31, 32, 33])),
+        formulation,
+        encoding,
+        draw(st.sampled_from([0.02, 0.3])),
+        draw(st.integers(0, 1000)),
+    )
+
+
+@st.composite
+def streams(draw, case, max_events=60):
+    """Events in any order: late, out of the sensor, of no polarity, before time zero, windows apart."""
+    n = draw(st.integers(0, max_events))
+    height, width = case.resolution
+    bin_us, window = case.geometry.bin_us, case.geometry.window_us
+    near = st.integers(-bin_us // 2, bin_us)
+    steps = st.one_of(near, near, near, st.integers(-2 * window, 2 * window), st.just(50 * window))
+    column = lambda elements: draw(arrays(np.int64, n, elements=elements))  # noqa: E731
+    start = draw(st.integers(-3 * window, 3 * window))
+    # Few columns and rows: counts pile up, cancel and saturate.
+    return make_events(
+        column(st.integers(0, width)),
+        column(st.integers(0, height)),
+        column(st.sampled_from([1, 0, 1, 0, 1, 0, 1, 0, -1, 2])),
+        start + np.cumsum(column(steps)),
+    )
+
+
+def random_events(rng, geometry, resolution, n, n_windows=3.0):
+    """The same kinds of events from a generator, most of them in order, on few pixels."""
+    span = int(geometry.window_us * n_windows) + 1
+    t = np.sort(rng.integers(-span // 2, span // 2 + 1, n))
+    moved = rng.random(n) < 0.2
+    t[moved] -= rng.integers(0, 2 * geometry.window_us + 1, moved.sum())
+    p = rng.integers(0, 2, n)
+    p[rng.random(n) < 0.03] = 2
+    height, width = resolution
+    return make_events(rng.integers(0, width + 1, n), rng.integers(0, height + 1, n), p, t)
+
+
+def fed_in_every_way(make_engine, events, rng):
+    """Engines that were fed the same events: `(how, engine)`, the first one in a single batch."""
+    whole = make_engine()
+    whole.feed(events)
+    yield "whole", whole
+
+    one_by_one = make_engine()
+    for i in range(len(events)):
+        one_by_one.feed(events[i : i + 1])
+    yield "one event at a time", one_by_one
+
+    cuts = np.sort(rng.integers(0, len(events) + 1, min(len(events), 6)))
+    split = make_engine()
+    for batch in np.split(events, cuts):  # equal cuts make empty batches
+        split.feed(batch)
+        split.feed(events[:0])
+    yield "randomly split, with empty batches", split
+
+    read = make_engine()
+    for batch in np.split(events, cuts):
+        read.feed(batch)
+        for look in rng.permutation([read.features, read.codes, read.snapshot, read.stats])[:2]:
+            look()
+        read.features()
+    yield "read at random moments", read
+
+    always_read = make_engine()
+    for i in range(len(events)):
+        always_read.feed(events[i : i + 1])
+        always_read.features()
+    yield "read after each event", always_read
+
+    told_the_time = make_engine()
+    latest = None
+    height, width = told_the_time.resolution
+    for event in events:
+        told_the_time.feed(np.array([event]))
+        if event["x"] < width and event["y"] < height and event["p"] in (0, 1):
+            latest = int(event["t"]) if latest is None else max(latest, int(event["t"]))
+            told_the_time.advance(latest - int(rng.integers(0, 3)))
+            told_the_time.advance(latest)
+    yield "told the time after each event", told_the_time

@@ -1,0 +1,56 @@
+"""Every compiled kernel against its slow twin, on random arguments, bit for bit."""
+
+import importlib
+import pkgutil
+
+import naive
+import numpy as np
+import pytest
+from kernel_table import KERNELS, Run, copied
+from numba.core.registry import CPUDispatcher
+
+from streamfeat import kernels
+from streamfeat.kernels.lasso import duality_gap
+
+ROUNDS = 30
+
+
+def all_kernels():
+    """Names of all compiled functions, each from the module it is defined in."""
+    for info in pkgutil.iter_modules(kernels.__path__, kernels.__name__ + "."):
+        module = importlib.import_module(info.name)
+        for name, value in vars(module).items():
+            if isinstance(value, CPUDispatcher) and value.py_func.__module__ == info.name:
+                yield name
+
+
+def run(function, arguments):
+    after = tuple(copied(a) for a in arguments)
+    return Run(arguments, after, function(*after))
+
+
+@pytest.mark.parametrize("row", KERNELS, ids=lambda row: row.name)
+def test_kernel_does_what_its_twin_does(row):
+    for seed in range(ROUNDS):
+        arguments = row.make(np.random.default_rng([seed, 7]))
+        row.agree(run(row.kernel, arguments), run(row.twin, arguments))
+
+
+def test_every_kernel_has_a_row_and_a_twin():
+    names = sorted(all_kernels())
+    assert sorted(row.name for row in KERNELS) == names
+    assert [name for name in names if not hasattr(naive, name)] == []
+
+
+def test_duality_gap_is_what_primal_and_dual_objective_differ_by():
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        atoms, x, code = rng.normal(size=(6, 20)), rng.normal(size=20), rng.normal(size=6)
+        rest = x - code @ atoms
+        penalty = 0.3
+        dual_point = rest * min(1, penalty / np.abs(atoms @ rest).max())
+        primal = rest @ rest / 2 + penalty * np.abs(code).sum()
+        dual = x @ x / 2 - (x - dual_point) @ (x - dual_point) / 2
+        gap = duality_gap(atoms @ rest, atoms @ x, code, float(x @ x), penalty)
+        assert gap == pytest.approx(primal - dual, rel=1e-9)
+        assert gap >= 0
