@@ -16,6 +16,7 @@ from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.events import Events, Resolution
+from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.recording import Label, Packet
 
 __all__ = ["Session", "SessionStats"]
@@ -114,6 +115,7 @@ class Session:
             self._origin = item.start_us
             self._last_us = item.start_us
             self._next_us = None
+            self._unread = 0
             if self._engine:
                 self._engine.restart(item.start_us)
             return
@@ -121,7 +123,7 @@ class Session:
         if len(events) == 0:
             return
         engine = self._engine_for(item.resolution)
-        latest = np.maximum.accumulate(events["t"])
+        latest = self._stream_times(events, item.resolution)
         end = len(events)
         if self._sample:
             stop = self._sample.start_us + self._sample.duration_us
@@ -138,6 +140,15 @@ class Session:
             yield self._read(self._engine, self._last_us + 1)
         if self.learner:
             self.learner.flush()
+
+    def _stream_times(self, events: Events, resolution: Resolution) -> NDArray[np.int64]:
+        """Stream time after each event: it never goes back, and events that will be rejected have no say."""
+        height, width = resolution
+        t = events["t"]
+        sound = (events["x"] < width) & (events["y"] < height) & (events["p"] >> 1 == 0) & (t < -BEFORE_TIME)
+        if not sound.all():
+            t = np.where(sound, t, BEFORE_TIME)
+        return np.maximum(np.maximum.accumulate(t), self._last_us)
 
     def _engine_for(self, resolution: Resolution) -> Engine:
         if self._engine and self._engine.resolution == resolution:
@@ -225,7 +236,8 @@ class Session:
         if sample is None:
             return
         self._stats.samples += 1
-        engine = self._engine or self._engine_for((self.encoder.geometry.patch,) * 2)
+        geometry = self.encoder.geometry
+        engine = self._engine or self._engine_for((geometry.patch * geometry.downsample,) * 2)
         emission = self._read(engine, sample.start_us + sample.duration_us, final=True)
         if emission.correct and self._stats.correct is not None:
             self._stats.correct += 1

@@ -1,0 +1,357 @@
+"""Sessions: when features are read, and that this never changes what they are."""
+
+import numpy as np
+import pytest
+import tiny
+
+from streamfeat.classifier import Classifier
+from streamfeat.emission import EmitPolicy
+from streamfeat.errors import InputError
+from streamfeat.events import make_events
+from streamfeat.features import EventFeatures, encode_samples, sample_end
+from streamfeat.geometry import Geometry
+from streamfeat.recording import Label, Packet, Sample
+from streamfeat.session import Session
+
+MODEL = tiny.encoder()
+WINDOW = tiny.GEOMETRY.window_us
+POLICIES = ["event", "7ev", "1000ev", "10ms", "3333us", "auto"]
+
+
+def run(items, policy="10ms", model=MODEL, classifier=None, **options):
+    session = Session(model, EmitPolicy.parse(policy), classifier, **options)
+    emissions = [e for item in items for e in session.process(item)]
+    return emissions + list(session.finish()), session
+
+
+def times(emissions):
+    return [e.t_us for e in emissions]
+
+
+def same(one, two):
+    """Whether two lists of emissions are equal, bit for bit."""
+    return len(one) == len(two) and all(
+        (a.t_us, a.n_events, a.sample, a.final, a.labels) == (b.t_us, b.n_events, b.sample, b.final, b.labels)
+        and np.array_equal(a.features, b.features)
+        and np.array_equal(a.scores, b.scores)
+        for a, b in zip(one, two, strict=True)
+    )
+
+
+def cut(items, rng):
+    """The same items with every packet cut at random places, empty packets included."""
+    for item in items:
+        if isinstance(item, Label):
+            yield item
+            continue
+        places = np.sort(rng.integers(0, len(item.events) + 1, rng.integers(0, 6)))
+        for part in np.split(item.events, places):
+            yield Packet(item.topic, part, item.resolution, item.log_time_ns, item.seq)
+
+
+# --- policies
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "every"),
+    [
+        ("event", "events", 1),
+        ("1000ev", "events", 1000),
+        ("10ms", "time", 10_000),
+        ("500us", "time", 500),
+        ("2s", "time", 2_000_000),
+        ("auto", "auto", 1),
+    ],
+)
+def test_policies_are_parsed(text, kind, every):
+    assert EmitPolicy.parse(text) == EmitPolicy(kind, every)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0ms", "10", "ms", "-1ev", "1.5ms", "10 ms", "10m", "EVENT", "01ms", "1ev\n"]
+)
+def test_bad_policies_are_refused(text):
+    with pytest.raises(InputError, match="--emit"):
+        EmitPolicy.parse(text)
+
+
+def test_every_event():
+    emissions, session = run([tiny.packet(tiny.stream([5, 5, 90, 40]))], "event")
+    # A reading reflects what came before it; an event from the past does not turn time back.
+    assert times(emissions) == [6, 6, 91, 91]
+    assert [e.n_events for e in emissions] == [1, 2, 3, 4]
+    assert session.stats().emissions == 4
+
+
+def test_every_so_many_events():
+    first, second = tiny.stream([1, 2, 3, 4, 5]), tiny.stream([6, 7, 8])
+    emissions, _ = run([tiny.packet(first), tiny.packet(second)], "3ev")
+    assert times(emissions) == [4, 7, 9]
+    assert [e.n_events for e in emissions] == [3, 6, 8]
+
+
+def test_every_so_many_microseconds():
+    emissions, _ = run([tiny.packet(tiny.stream([3, 9, 10, 35]))], "10us")
+    # An event at 10 is not before 10. Silence inside the window is read on: bins roll.
+    assert times(emissions) == [10, 20, 30, 36]
+    assert [e.n_events for e in emissions] == [2, 3, 3, 4]
+
+
+def test_times_are_counted_from_the_start_of_a_sample():
+    items = [Label(1003, 30, "cat"), tiny.packet(tiny.stream([1004, 1014, 1031]))]
+    emissions, _ = run(items, "10us")
+    assert times(emissions) == [1013, 1023, 1033]
+    assert [e.final for e in emissions] == [False, False, True]
+
+
+def test_auto_rests_four_times_as_long_as_reading_takes():
+    clock = FakeClock()
+    session = Session(MODEL, EmitPolicy.parse("auto"), clock=clock)
+    reading = session._read
+
+    def slow_reading(*args, **options):
+        clock.now += 1.0
+        return reading(*args, **options)
+
+    session._read = slow_reading
+    read_at = []
+    for i in range(40):
+        clock.now = max(clock.now, 0.5 * i)
+        if list(session.process(tiny.packet(tiny.stream([10 * i])))):
+            read_at.append(i)
+    # A reading at 0 s takes until 1 s; the next is at 5 s, packet 10, and so on.
+    assert read_at == [0, 10, 20, 30]
+    # The nine events since are read at the end.
+    assert times(session.finish()) == [391]
+
+
+class FakeClock:
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_auto_reads_everything_where_reading_is_free():
+    items = [tiny.packet(tiny.stream([i])) for i in range(5)]
+    emissions, _ = run(items, "auto")
+    assert times(emissions) == [1, 2, 3, 4, 5]
+
+
+# --- the result does not depend on the policy, nor on packets
+
+
+@pytest.mark.parametrize("encoding", ["soft", "split", "triangle"])
+def test_finals_do_not_depend_on_the_policy_and_equal_the_offline_path(encoding):
+    model = tiny.encoder(encoding=encoding)
+    items = tiny.labelled_items(4)
+    samples = [
+        Sample(label, np.concatenate([a.events, b.events]), tiny.RESOLUTION)
+        for label, a, b in zip(items[::3], items[1::3], items[2::3], strict=True)
+    ]
+    expected = [
+        model.encode(s.events, s.resolution, origin_us=s.label.start_us, t_us=sample_end(s.label))
+        for s in samples
+    ]
+    assert all(features.any() for features in expected)
+    for policy in POLICIES:
+        emissions, _ = run(items, policy, model)
+        finals = [e for e in emissions if e.final]
+        assert [e.sample for e in finals] == items[::3]
+        for emission, features in zip(finals, expected, strict=True):
+            assert np.array_equal(emission.features, features)
+            assert emission.t_us == emission.sample.start_us + emission.sample.duration_us
+    encoded = list(encode_samples(model, samples, threads=3))
+    assert [label for label, _ in encoded] == items[::3]
+    assert np.array_equal([features for _, features in encoded], expected)
+    assert np.array_equal(EventFeatures(model, threads=2).fit([]).transform(samples), expected)
+    assert EventFeatures(model).transform([]).shape == (0, model.n_features)
+
+
+def test_inverse_finals_agree_within_the_gap():
+    model = tiny.encoder("inverse", "soft")
+    items = tiny.labelled_items(3)
+    finals = [[e for e in run(items, policy, model)[0] if e.final] for policy in POLICIES]
+    for other in finals[1:]:
+        for a, b in zip(finals[0], other, strict=True):
+            assert a.features == pytest.approx(b.features, abs=0.05 * float(np.abs(a.features).max()))
+
+
+@pytest.mark.parametrize("policy", ["event", "7ev", "100ev", "10ms", "3333us"])
+@pytest.mark.parametrize("seed", range(3))
+def test_packets_may_be_cut_anywhere(policy, seed):
+    rng = np.random.default_rng(seed)
+    items = tiny.labelled_items(3)
+    # Events that no sample claims, before, between and after, and some out of order.
+    free = tiny.steady(0, 120_000, 200, seed=7)
+    free["t"] = np.maximum(free["t"] - rng.integers(0, 2, 200) * rng.integers(0, 30_000, 200), 0)
+    late = tiny.steady(800_000, 3_000_000, 150, seed=8)
+    items = [tiny.packet(free), *items, tiny.packet(late)]
+    clf = tiny.classifier(MODEL)
+    whole, session = run(items, policy, classifier=clf)
+    for _ in range(3):
+        pieces, other = run(cut(items, rng), policy, classifier=clf)
+        assert same(whole, pieces)
+        assert session.stats() == other.stats()
+
+
+# --- labels
+
+
+def test_samples_start_empty_and_events_after_the_end_are_not_theirs():
+    label = Label(1000, 500, "cat", "train", "x")
+    inside, after = tiny.steady(1000, 1500, 50, seed=1), tiny.steady(1500, 1900, 60, seed=2)
+    before = tiny.steady(0, 1000, 70, seed=3)
+    emissions, _ = run([tiny.packet(before), label, tiny.packet(np.concatenate([inside, after]))], "1000ev")
+    final, rest = emissions
+    assert (final.final, final.sample, final.t_us, final.n_events) == (True, label, 1500, 120)
+    assert np.array_equal(final.features, MODEL.encode(inside, tiny.RESOLUTION, origin_us=1000, t_us=1499))
+    assert (rest.final, rest.sample, rest.n_events) == (False, None, 180)
+
+
+def test_events_before_a_label_do_not_count_towards_its_first_reading():
+    items = [
+        tiny.packet(tiny.stream([1, 2])),
+        Label(100, 50, "cat"),
+        tiny.packet(tiny.stream([101, 102, 103])),
+    ]
+    assert times(run(items, "3ev")[0]) == [104, 150]
+
+
+def test_a_sample_without_events_has_zero_features():
+    items = [Label(0, 100, "cat"), Label(200, 100, "dog"), tiny.packet(tiny.stream([250]))]
+    for geometry in (tiny.GEOMETRY, Geometry(patch=4, stride=4, n_bins=2, bin_us=50_000, downsample=3)):
+        model = tiny.encoder(geometry=geometry)
+        emissions, session = run(items, "auto", model)
+        assert not emissions[0].features.any()
+        assert emissions[0].features.shape == (model.n_features,)
+        assert emissions[0].final
+        assert session.stats().samples == 2
+
+
+def test_a_sample_without_events_after_one_with():
+    items = [*tiny.labelled_items(1), Label(900_000, 100, "dog"), Label(990_000, 100, "dog")]
+    finals = [e for e in run(items, "1000ev")[0] if e.final]
+    assert [bool(e.features.any()) for e in finals] == [True, False, False]
+
+
+def test_the_last_sample_is_read_at_its_end_though_the_stream_ends_before():
+    items = tiny.labelled_items(1)
+    emissions, _ = run([items[0], items[1]], "1000ev")
+    assert times(emissions) == [items[0].start_us + items[0].duration_us]
+
+
+def test_a_change_of_resolution_starts_anew_and_keeps_count():
+    small = tiny.steady(1_000_000, 1_080_000, 40, seed=4, resolution=(8, 8))
+    items = [*tiny.labelled_items(1), Label(1_000_000, 80_000, "dog"), tiny.packet(small, (8, 8))]
+    emissions, session = run(items, "1000ev")
+    expected = MODEL.encode(small, (8, 8), origin_us=1_000_000, t_us=1_079_999)
+    assert np.array_equal(emissions[-1].features, expected)
+    assert emissions[-1].n_events == session.stats().events == 340
+    with pytest.raises(InputError, match="too small"):
+        run([*items, tiny.packet(tiny.stream([2_000_000], resolution=(3, 3)), (3, 3))])
+
+
+# --- silence, and events that make no sense
+
+
+@pytest.mark.parametrize("policy", ["10ms", "1ms"])
+def test_silence_is_not_read_over_and_over(policy):
+    hour = 3_600_000_000
+    every = EmitPolicy.parse(policy).every
+    stream = tiny.stream([5, 4 * hour + 7, 9 * hour])
+    for items in (
+        [tiny.packet(stream)],
+        [tiny.packet(stream[i : i + 1]) for i in range(3)],
+        [Label(0, 10 * hour, "cat"), tiny.packet(stream)],
+    ):
+        emissions, _ = run(items, policy)
+        assert len(emissions) <= 3 * (WINDOW // every + 2)
+        # Until the window has emptied there is something to tell, and the last reading tells that.
+        read = [e for e in emissions if e.t_us < hour]
+        assert times(read) == list(range(every, WINDOW + every + 1, every))
+        assert read[0].features.any()
+        assert not read[-1].features.any()
+
+
+def test_rejected_events_have_no_say_in_stream_time():
+    good = tiny.stream([10, 20, 30, 40])
+    bad = make_events([999, 0, 0, 3], [0, 999, 0, 3], [1, 1, 7, 1], [5_000_000, 900, 10**9, 2**62 + 5])
+    mixed = np.concatenate([bad[:1], good[:2], bad[1:], good[2:]])
+    sample = Label(0, 100, "cat")
+    for policy in ("event", "10us", "auto"):
+        for head in ([], [sample]):
+            emissions, session = run([*head, tiny.packet(mixed)], policy)
+            expected, clean = run([*head, tiny.packet(good)], policy)
+            assert emissions[-1].t_us == expected[-1].t_us
+            assert np.array_equal(emissions[-1].features, expected[-1].features)
+            stats = session.stats()
+            assert (stats.events, stats.rejected, stats.late) == (4, 4, 0)
+            assert clean.stats().rejected == 0
+
+
+def test_time_that_goes_back_is_late_and_nothing_else():
+    ahead = tiny.steady(10 * WINDOW, 11 * WINDOW, 30)
+    back = tiny.steady(0, WINDOW, 20)
+    for policy in POLICIES:
+        emissions, session = run([tiny.packet(ahead), tiny.packet(back)], policy)
+        assert session.stats().late == 20
+        assert session.stats().events == 30
+        assert times(emissions) == sorted(times(emissions))
+
+
+# --- classifiers
+
+
+def test_scores_and_totals():
+    clf = tiny.classifier(MODEL)
+    items = tiny.labelled_items(6)
+    emissions, session = run(items, "50ev", classifier=clf)
+    for e in emissions:
+        assert e.labels == clf.labels
+        assert np.array_equal(e.scores, clf.scores(e.features))
+        assert e.prediction == clf.predict(e.features)
+        assert e.correct == (e.prediction == e.sample.label)
+    finals = [e for e in emissions if e.final]
+    stats = session.stats()
+    assert stats.correct == sum(e.correct for e in finals)
+    assert (stats.samples, stats.events, stats.emissions) == (6, 1800, len(emissions))
+    assert stats.late == stats.rejected == stats.unknown_labels == 0
+    assert emissions[-1].n_events == 1800
+    assert run(items, "50ev")[1].stats().correct is None
+
+
+def test_without_a_classifier_nothing_is_predicted():
+    for e in run(tiny.labelled_items(1))[0]:
+        assert (e.labels, e.scores.shape, e.prediction, e.correct) == ((), (0,), None, None)
+
+
+def test_a_classifier_of_another_model_is_refused():
+    with pytest.raises(InputError, match="another model"):
+        run([], classifier=tiny.classifier(tiny.encoder(seed=1)))
+
+
+def test_learning_online_predicts_first():
+    """Equal to the plain loop: predict with what is known, then learn."""
+    from streamfeat.classifier import OnlineClassifier
+
+    names = ("cat", "dog", "owl")
+    items = tiny.labelled_items(40, names=names)
+    start = Classifier.untrained(names, MODEL)
+    emissions, session = run(items, "1000ev", classifier=start, learn_online=True)
+    learner = OnlineClassifier(start)
+    for e in [e for e in emissions if e.final]:
+        assert np.array_equal(e.scores, learner.classifier.scores(e.features))
+        learner.learn_one(e.features, e.sample.label)
+    learner.flush()
+    assert np.array_equal(session.classifier.weights, learner.classifier.weights)
+    assert session.classifier.provenance["learned_online"] == 40
+    assert start.weights.any() == np.False_
+
+
+def test_unknown_labels_are_counted_and_not_learned():
+    clf = tiny.classifier(MODEL, ("cat", "dog"))
+    _, session = run(tiny.labelled_items(6), "1000ev", classifier=clf, learn_online=True)
+    assert session.stats().unknown_labels == 2
+    assert session.classifier.provenance["learned_online"] == 4
