@@ -5,6 +5,7 @@ Not here: how it is computed (`session`, `pipeline`), how it looks (`sinks`, `cl
 """
 
 import asyncio
+import contextlib
 import signal
 import time
 from collections.abc import Iterable, Iterator
@@ -93,14 +94,23 @@ class Replay:
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
         """
-        sinks: list[Sink] = []
-        if console:
-            sinks.append(TerminalSink(console))
-        if json_lines:
-            sinks.append(JsonLinesSink(json_lines, features=with_features))
-        if recording_out:
-            sinks.append(RecordingSink(RecordingWriter(recording_out, overwrite=True)))
-        with open_recording(self._recording, self._topic) as rec:
+        with contextlib.ExitStack() as opening:
+            sinks: list[Sink] = []
+
+            def add(sink: Sink) -> None:
+                sinks.append(sink)
+                opening.callback(sink.close, failed=True)
+
+            if console:
+                add(TerminalSink(console))
+            if json_lines:
+                add(JsonLinesSink(json_lines, features=with_features))
+            if recording_out:
+                add(RecordingSink(RecordingWriter(recording_out, overwrite=True)))
+            rec = open_recording(self._recording, self._topic)
+            # From here on the pipeline closes the sinks.
+            opening.pop_all()
+        with rec:
             started = time.perf_counter()
             asyncio.run(self._run(rec, sinks))
             self._seconds = time.perf_counter() - started

@@ -74,6 +74,8 @@ class JsonLinesSink:
         """Write a line for each emission."""
         lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
         self._stream.writelines(lines)  # type: ignore[union-attr]
+        if self._path is None:
+            self._stream.flush()  # type: ignore[union-attr]
 
     def close(self, *, failed: bool) -> None:
         """Put the file in its place, or remove it."""
@@ -128,18 +130,18 @@ class TerminalSink:
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Count every emission, and show one where it is time to."""
-        for e in emissions:
-            if e.final:
-                self._samples += 1
-                self._correct += bool(e.correct)
-        shown = next((e for e in reversed(emissions) if e.final), None)
+        finals = [e for e in emissions if e.final]
+        self._samples += len(finals)
+        self._correct += sum(bool(e.correct) for e in finals)
+        self._skipped += len(finals)
+        shown = finals[-1] if finals else None
         if shown is None:
             if any(e.sample for e in emissions):
                 return
             shown = emissions[-1]
         if self._clock() < self._next:
-            self._skipped += sum(e.final for e in emissions) or 0
             return
+        self._skipped -= shown.final
         self._next = self._clock() + (1 / _LINES_A_SECOND if shown.final else 1.0)
         self._console.print(self._line(shown), highlight=False)
 

@@ -90,14 +90,13 @@ def write_items(path, items, **options):
     return path
 
 
-def write_digits(path, n=20, *, split="train", held_out_every=None, seed=0):
-    """Simulated digits as a labelled recording: 100 ms each, 34x34 pixels."""
+def write_digits(path, n=20, *, split="train", n_held_out=0, seed=0):
+    """Simulated digits as a labelled recording: 100 ms each, 34x34 pixels; the first few may be held out."""
     start = 200_000
     with RecordingWriter(path) as writer:
         samples = digit_samples(n, seed, split, saccades=Saccades(saccade_us=33_000))
         for i, sample in enumerate(samples):
-            held_out = held_out_every is not None and i % held_out_every == 0
-            name = "test" if held_out else split
+            name = "test" if i < n_held_out else split
             writer.write_label(Label(start, 100_000, sample.label, name, sample.source))
             moved = sample.events.copy()
             moved["t"] += start

@@ -1,0 +1,347 @@
+"""The pipeline: same results as a plain loop, bounded queues, and every way to end."""
+
+import asyncio
+import json
+import tempfile
+import threading
+import time
+
+import numpy as np
+import pytest
+import tiny
+
+from streamfeat.emission import EmitPolicy
+from streamfeat.errors import InputError
+from streamfeat.pipeline import Pipeline
+from streamfeat.recorder import RecordingWriter
+from streamfeat.recording import open_recording
+from streamfeat.replay import Replay
+from streamfeat.session import Session
+from streamfeat.sinks import JsonLinesSink, RecordingSink, TerminalSink
+
+MODEL = tiny.encoder(k=3)
+CLASSIFIER = tiny.classifier(MODEL, [str(digit) for digit in range(10)])
+
+
+class ListSink:
+    """Keeps what it is given; `hold` makes it wait, as a slow disk would."""
+
+    def __init__(self):
+        self.parts = []
+        self.closed = None
+        self.hold = threading.Event()
+        self.hold.set()
+
+    def write(self, emissions):
+        assert self.hold.wait(30)
+        self.parts.append(list(emissions))
+
+    def close(self, *, failed):
+        self.closed = "failed" if failed else "done"
+
+    @property
+    def emissions(self):
+        return [e for part in self.parts for e in part]
+
+
+class BrokenSink(ListSink):
+    def write(self, emissions):
+        super().write(emissions)
+        raise OSError("no room")
+
+
+def session(policy="10ms", **options):
+    return Session(MODEL, EmitPolicy.parse(policy), CLASSIFIER, **options)
+
+
+def plain_loop(items, policy="10ms", **options):
+    one = session(policy, **options)
+    return [e for item in items for e in one.process(item)] + list(one.finish()), one
+
+
+def same(one, two):
+    assert len(one) == len(two)
+    for a, b in zip(one, two, strict=True):
+        assert (a.t_us, a.n_events, a.sample, a.final) == (b.t_us, b.n_events, b.sample, b.final)
+        assert np.array_equal(a.features, b.features)
+        assert np.array_equal(a.scores, b.scores)
+
+
+async def until(condition):
+    """Let the loop turn until something holds; the suite's timeout is the limit."""
+    while not condition():
+        await asyncio.sleep(0)
+
+
+@pytest.fixture(scope="module")
+def digits(tmp_path_factory):
+    return tiny.write_digits(tmp_path_factory.mktemp("digits") / "digits.mcap", 12)
+
+
+@pytest.mark.parametrize("policy", ["10ms", "20ev", "1000ev"])
+@pytest.mark.parametrize("speed", [None, 1e6])
+def test_results_are_those_of_a_plain_loop(digits, policy, speed):
+    with open_recording(digits) as recording:
+        expected, loop_session = plain_loop(recording.items(), policy, learn_online=True)
+        sink, other = ListSink(), ListSink()
+        one = session(policy, learn_online=True)
+        pipeline = Pipeline(recording.items(), one, [sink, other], speed=speed)
+        asyncio.run(pipeline.run())
+    same(sink.emissions, expected)
+    assert other.parts == sink.parts
+    assert one.stats() == loop_session.stats()
+    assert np.array_equal(one.classifier.weights, loop_session.classifier.weights)
+    assert (sink.closed, other.closed) == ("done", "done")
+    assert not pipeline.stats().stopped
+    assert pipeline.stats().queued_in == pipeline.stats().queued_out == pipeline.stats().dropped == 0
+
+
+def test_many_emissions_of_one_packet_are_handed_on_in_parts():
+    sink = ListSink()
+    asyncio.run(Pipeline([tiny.packet(tiny.steady(0, 50_000, 1000))], session("event"), [sink]).run())
+    assert [len(part) for part in sink.parts] == [256, 256, 256, 232]
+
+
+def test_nothing_in_nothing_out():
+    sink = ListSink()
+    asyncio.run(Pipeline([], session(), [sink]).run())
+    assert (sink.parts, sink.closed) == ([], "done")
+
+
+def endless(packets_read, n_events=40_000):
+    """A source that never ends, and counts what it was asked for."""
+    start = 0
+    while True:
+        packets_read.append(start)
+        yield tiny.packet(tiny.steady(start, start + 5_000, n_events, seed=len(packets_read)))
+        start += 5_000
+
+
+def test_a_slow_sink_fills_bounded_queues_and_loses_nothing():
+    read, sink = [], ListSink()
+    sink.hold.clear()
+    one = session("1000ev")
+
+    async def run():
+        pipeline = Pipeline(endless(read), one, [sink])
+        task = asyncio.create_task(pipeline.run())
+        await until(lambda: pipeline.stats().queued_in == 8 and pipeline.stats().queued_out == 8)
+        # One group more is in the hands of each task.
+        n_items = pipeline.stats().items
+        assert n_items <= 8 + 8 + 3
+        assert len(read) <= n_items + 2
+        pipeline.stop()
+        sink.hold.set()
+        await task
+        assert pipeline.stats().stopped
+        return pipeline.stats().items
+
+    n_items = asyncio.run(run())
+    expected, _ = plain_loop([item for item, _ in zip(endless([]), range(n_items), strict=False)], "1000ev")
+    same(sink.emissions, expected)
+    assert one.stats().events == 40_000 * n_items
+    assert sink.closed == "done"
+
+
+def test_a_sink_that_fails_ends_everything(tmp_path):
+    good, broken = ListSink(), BrokenSink()
+    sinks = [
+        good,
+        JsonLinesSink(tmp_path / "out.jsonl"),
+        RecordingSink(RecordingWriter(tmp_path / "out.mcap")),
+        broken,
+    ]
+    with pytest.raises(OSError, match="no room"):
+        asyncio.run(Pipeline(endless([]), session(), sinks).run())
+    assert (good.closed, broken.closed) == ("failed", "failed")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_source_that_fails_ends_everything(tmp_path):
+    def source():
+        yield tiny.packet(tiny.steady(0, 50_000, 100))
+        raise InputError("torn cable")
+
+    sink = ListSink()
+    sinks = [sink, RecordingSink(RecordingWriter(tmp_path / "out.mcap"))]
+    with pytest.raises(InputError, match="torn cable"):
+        asyncio.run(Pipeline(source(), session(), sinks).run())
+    assert sink.closed == "failed"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_session_ends_everything():
+    sink = ListSink()
+    items = [tiny.packet(tiny.steady(0, 100, 10)), tiny.packet(tiny.stream([1], resolution=(3, 3)), (3, 3))]
+    with pytest.raises(InputError, match="too small"):
+        asyncio.run(Pipeline(items, session(), [sink]).run())
+    assert sink.closed == "failed"
+
+
+def test_a_sink_that_cannot_be_closed_does_not_keep_others_open():
+    class Stuck(ListSink):
+        def close(self, *, failed):
+            raise OSError("cannot close")
+
+    first, last = ListSink(), ListSink()
+    with pytest.raises(OSError, match="cannot close"):
+        asyncio.run(Pipeline([], session(), [first, Stuck(), last]).run())
+    # Sinks are closed from the last to the first.
+    assert last.closed == "done"
+    assert first.closed == "failed"
+
+
+@pytest.mark.parametrize("speed", [None, 0.05])
+def test_stop_keeps_what_was_read(tmp_path, speed):
+    read, sink, target = [], ListSink(), tmp_path / "out.mcap"
+
+    async def run():
+        sinks = [sink, RecordingSink(RecordingWriter(target))]
+        pipeline = Pipeline(endless(read, 1000), session("500ev"), sinks, speed=speed)
+        task = asyncio.create_task(pipeline.run())
+        await until(lambda: sink.parts)
+        pipeline.stop()
+        await task
+        return pipeline.stats()
+
+    stats = asyncio.run(run())
+    assert stats.stopped
+    assert sink.closed == "done"
+    assert sink.emissions[-1].n_events == 1000 * stats.items
+    from mcap.reader import make_reader
+
+    with target.open("rb") as file:
+        counts = make_reader(file).get_summary().statistics.message_count
+    assert counts == 2 * len(sink.emissions)
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_cancelling_the_task_closes_sinks_as_failed(tmp_path):
+    sink = ListSink()
+
+    async def run():
+        sinks = [sink, JsonLinesSink(tmp_path / "out.jsonl")]
+        task = asyncio.create_task(Pipeline(endless([], 1000), session(), sinks).run())
+        await until(lambda: sink.parts)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    assert sink.closed == "failed"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_is_told_in_order(digits):
+    told = []
+    with open_recording(digits) as recording:
+        pipeline = Pipeline(recording.items(), session(), [], speed=1e6, on_progress=told.append)
+        asyncio.run(pipeline.run())
+        assert told[-1] == recording.last_us
+    assert told == sorted(told)
+
+
+def test_the_recorded_pace_is_kept():
+    # One packet of 400 ms at twice its pace; it is cut, so that readings do not wait for its end.
+    sink = ListSink()
+    arrived = []
+    write = sink.write
+    sink.write = lambda emissions: (arrived.append(time.monotonic()), write(emissions))
+    items = [tiny.packet(tiny.steady(0, 400_000, 2000))]
+    started = time.monotonic()
+    asyncio.run(Pipeline(items, session("100ms"), [sink], speed=2.0).run())
+    assert time.monotonic() - started > 0.19
+    assert len(sink.parts) == 4
+    assert arrived[-1] - arrived[0] > 0.1
+    same(sink.emissions, plain_loop(items, "100ms")[0])
+
+
+# --- sinks
+
+
+def emissions_of(n=3, policy="1000ev"):
+    return plain_loop(tiny.labelled_items(n, names=("1", "2")), policy)[0]
+
+
+def test_json_lines(tmp_path):
+    emissions = emissions_of()
+    sink = JsonLinesSink(tmp_path / "a.jsonl", features=True)
+    sink.write(emissions[:1])
+    assert not (tmp_path / "a.jsonl").exists()
+    sink.write(emissions[1:])
+    sink.close(failed=False)
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert len(lines) == len(emissions)
+    for line, e in zip(lines, emissions, strict=True):
+        assert (line["t_us"], line["n_events"], line["prediction"]) == (e.t_us, e.n_events, e.prediction)
+        assert np.allclose(list(line["scores"].values()), e.scores, atol=1e-6)
+        assert tuple(line["scores"]) == e.labels
+        assert np.array_equal(np.array(line["features"], np.float32), e.features)
+        assert line["sample"]["label"] == e.sample.label
+        assert line["sample"]["elapsed_us"] == 80_000
+    with pytest.raises(InputError, match="cannot write there"):
+        JsonLinesSink(tmp_path / "no" / "a.jsonl")
+
+
+def test_json_lines_to_a_stream_do_not_wait_for_a_full_buffer():
+    with tempfile.TemporaryFile("w+") as stream, open(stream.fileno(), closefd=False) as reader:
+        sink = JsonLinesSink(stream)
+        sink.write(emissions_of(1))
+        reader.seek(0)
+        assert json.loads(reader.readline())["n_events"] == 300
+        sink.close(failed=True)
+        assert not stream.closed
+
+
+class Screen:
+    def __init__(self):
+        self.lines = []
+
+    def print(self, text, **_options):
+        self.lines.append(str(text))
+
+
+def test_the_terminal_is_not_flooded_and_what_is_not_shown_is_counted():
+    screen, clock = Screen(), [0.0]
+    sink = TerminalSink(screen, clock=lambda: clock[0])
+    finals = emissions_of(10)
+    assert all(e.final for e in finals)
+    sink.write(finals[:4])
+    sink.write(finals[4:6])
+    clock[0] += 1
+    sink.write(finals[6:7])
+    sink.write(finals[7:])
+    sink.close(failed=False)
+    # Of four, one is shown; of two, none; then one, and none of three.
+    assert len(screen.lines) == 3
+    assert "8 samples" in screen.lines[-1]
+    assert "of 7" in screen.lines[1]
+
+
+def test_the_terminal_without_labels():
+    screen, clock = Screen(), [0.0]
+    sink = TerminalSink(screen, clock=lambda: clock[0])
+    for i in range(30):
+        clock[0] = i / 10
+        sink.write(plain_loop([tiny.packet(tiny.stream([i]))], "event")[0])
+    sink.close(failed=False)
+    assert len(screen.lines) == 3
+
+
+# --- replay
+
+
+def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
+    MODEL.save(tmp_path / "model")
+    (tmp_path / "out.mcap.part").write_bytes(b"left over")
+    job = Replay(digits, tmp_path / "model")
+    with pytest.raises(InputError, match="left by a writer"):
+        job.run(recording_out=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "out.mcap.part"]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", "", "1e9"])
+def test_bad_speeds_are_refused(tmp_path, digits, text):
+    MODEL.save(tmp_path / "model")
+    with pytest.raises(InputError, match="--speed"):
+        Replay(digits, tmp_path / "model", speed=text)
