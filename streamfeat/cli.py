@@ -40,8 +40,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out = Console(highlight=False, emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="REC", help="MCAP recording of events.")]
 RecordingsArgument = Annotated[
@@ -60,6 +60,9 @@ def main() -> NoReturn:
     except InputError as error:
         err.print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}", soft_wrap=True)
         sys.exit(2)
+    except MemoryError as error:
+        err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
+        sys.exit(2)
     sys.exit(0)
 
 
@@ -74,7 +77,7 @@ def progress_bars() -> Iterator[Callable[[str, int, int, str], None]]:
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         TextColumn("[dim]{task.fields[remark]}"),
     )
-    with Progress(*columns, console=err, transient=not err.is_terminal) as progress:
+    with Progress(*columns, console=err, disable=not err.is_terminal) as progress:
         tasks: dict[str, Any] = {}
 
         def report(step: str, done: int, total: int, remark: str) -> None:
@@ -113,6 +116,8 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     """Refuse to replace a file unless asked to, before any work is done."""
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; give another name or --overwrite")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a file")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
 
@@ -168,6 +173,8 @@ def convert(
     """A data set folder or a camera file to MCAP, with labels and splits from the folder layout."""
     from streamfeat.foreign import datasets
 
+    if not 0 < gap_ms < 1e9:
+        raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
     with progress_bars() as report:
         done = datasets.convert(
             source,
@@ -366,9 +373,8 @@ def replay(
         json_lines=sys.stdout if to_terminal else json_lines,
         with_features=features,
     )
-    if to_terminal:
-        return
-    print_result(job.result(), "replayed", as_json=as_json)
+    if not to_terminal:
+        print_result(job.result(), "replayed", as_json=as_json)
     print_losses(job.losses)
     if job.interrupted:
         raise typer.Exit(130)

@@ -1,0 +1,477 @@
+"""The command line, end to end: what it prints, writes and refuses."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tiny
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
+from safetensors import safe_open
+from safetensors.numpy import save_file
+from typer.testing import CliRunner
+
+from streamfeat import cli
+from streamfeat.classifier import Classifier
+from streamfeat.encoder import Encoder
+from streamfeat.events import make_events
+from streamfeat.features import sample_end
+from streamfeat.messages import EventPacket
+from streamfeat.recorder import RecordingWriter
+from streamfeat.recording import Label, open_recording
+
+LEARN = ["--filters", "6", "--patch", "6", "--stride", "7", "--bins", "2", "--volumes", "300"]
+LEARN += ["--iterations", "2"]
+COMMANDS = ["info", "convert", "learn", "train", "replay"]
+
+
+class Result:
+    def __init__(self, status, out, err):
+        self.status, self.out, self.err = status, out, err
+
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
+@pytest.fixture
+def run(monkeypatch, capfd):
+    """Run the command line in this process, through `main`."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        captured = capfd.readouterr()
+        return Result(end.value.code or 0, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A folder with recordings, and a model and a classifier for each formulation."""
+    home = tmp_path_factory.mktemp("home")
+    tiny.write_digits(home / "train.mcap", 40, n_held_out=10)
+    tiny.write_digits(home / "test.mcap", 10, split="test")
+    runner = CliRunner()
+    for formulation in ("direct", "inverse"):
+        model, clf = str(home / formulation), str(home / f"{formulation}.clf")
+        learn = ["learn", str(home / "train.mcap"), "-o", model, "--formulation", formulation, *LEARN]
+        assert runner.invoke(cli.app, learn).exit_code == 0
+        train = ["train", str(home / "train.mcap"), "-m", model, "-o", clf]
+        assert runner.invoke(cli.app, train).exit_code == 0
+    return home
+
+
+def snapshot(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+# --- what works
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example(command):
+    result = CliRunner().invoke(cli.app, [command, "--help"])
+    assert result.exit_code == 0
+    assert f"Example: streamfeat {command} " in result.stdout
+
+
+def test_info_of_a_real_recording(run, shared_data):
+    result = run("info", shared_data / "samples/eventpacket_libcaer_cmp_346x260.mcap", "--json")
+    said = result.json
+    assert (said["resolution"], said["on"], said["off"]) == ("346x260", 211_043, 360_223)
+    assert (said["events"], said["encoding"], said["integrity"]) == (571_266, "libcaer_cmp", "intact")
+    assert said["first_us"] == 1744227144732712
+    assert (result.status, result.err) == (0, "")
+
+
+def test_info_of_a_labelled_recording(run, home):
+    said = run("info", home / "train.mcap", "--json").json
+    assert (said["samples"], said["splits"], said["labels"]) == (
+        40,
+        "test, train",
+        "0, 1, 2, 3, 4, 5, 6, 7, 8, 9",
+    )
+    table = run("info", home / "train.mcap").out
+    assert f"{said['events']:,}" in table
+    assert "34x34" in table
+
+
+def nmnist_folder(folder):
+    """Two digits in the layout of N-MNIST: 40 bits an event."""
+    for i in range(8):
+        events = tiny.steady(0, 90_000, 150, seed=i, resolution=(34, 34))
+        data = np.zeros((150, 5), np.uint8)
+        data[:, 0], data[:, 1] = events["x"], events["y"]
+        for byte, shift in ((2, 16), (3, 8), (4, 0)):
+            data[:, byte] = events["t"] >> shift & 0xFF
+        data[:, 2] |= (events["p"] << 7).astype(np.uint8)
+        path = folder / "Train" / str(i % 2) / f"{i:05}.bin"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.tobytes())
+    return folder
+
+
+def test_from_a_data_set_to_predictions(run, tmp_path):
+    source, recording = nmnist_folder(tmp_path / "digits"), tmp_path / "digits.mcap"
+    said = run("convert", source, recording, "--json").json
+    assert (said["samples"], said["events"], said["failed"], said["damaged"]) == (8, 1200, 0, 0)
+    assert run("learn", recording, "-o", tmp_path / "model", *LEARN).status == 0
+    assert (
+        run("train", recording, "-m", tmp_path / "model", "-o", tmp_path / "clf", "--json").json["samples"]
+        == 8
+    )
+    said = run("replay", recording, "-m", tmp_path / "model", "-c", tmp_path / "clf", "--json").json
+    assert (said["samples"], said["events"], said["lost"]) == (8, 1200, 0)
+    assert said["accuracy"] == said["correct"] / 8
+
+
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_learn_and_train(run, home, tmp_path, formulation):
+    said = run(
+        "learn", home / "train.mcap", "-o", tmp_path / "m", "--formulation", formulation, *LEARN, "--json"
+    ).json
+    assert (said["filters"], said["features"], said["formulation"]) == (6, 48, formulation)
+    model = Encoder.load(tmp_path / "m")
+    assert model.fingerprint == Encoder.load(home / formulation).fingerprint
+    assert model.geometry.bin_us == 50_000
+    # Thirty of forty samples are not held out.
+    assert model.provenance["windows"] == 30
+    said = run("train", home / "train.mcap", "-m", tmp_path / "m", "-o", tmp_path / "c", "--json").json
+    assert (said["samples"], said["held_out_samples"]) == (30, 10)
+    assert 0 <= said["held_out_accuracy"] <= 1
+    assert Classifier.load(tmp_path / "c").fingerprint == model.fingerprint
+
+
+def offline(model, path, split=None):
+    with open_recording(path) as recording:
+        return [
+            (
+                s.label,
+                model.encode(s.events, s.resolution, origin_us=s.label.start_us, t_us=sample_end(s.label)),
+            )
+            for s in recording.samples()
+            if split in (None, s.label.split)
+        ]
+
+
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_replay_into_a_recording(run, home, tmp_path, formulation):
+    target, lines = tmp_path / "out.mcap", tmp_path / "out.jsonl"
+    model, clf = Encoder.load(home / formulation), Classifier.load(home / f"{formulation}.clf")
+    arguments = ["-m", home / formulation, "-c", home / f"{formulation}.clf", "--emit", "20ms"]
+    said = run(
+        "replay", home / "test.mcap", *arguments, "-o", target, "--json-lines", lines, "--features", "--json"
+    ).json
+    with target.open("rb") as file:
+        messages = [
+            (channel.topic, message.log_time // 1000, ros)
+            for _, channel, message, ros in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        ]
+    features = [(t, ros) for topic, t, ros in messages if topic == "/features"]
+    predictions = [ros for topic, _, ros in messages if topic == "/prediction"]
+    records = [json.loads(line) for line in lines.read_text().splitlines()]
+    assert len(features) == len(predictions) == len(records) == said["emissions"]
+    for (t, feature), prediction, record in zip(features, predictions, records, strict=True):
+        assert (t, feature.n_events, prediction.label) == (
+            record["t_us"],
+            record["n_events"],
+            record["prediction"],
+        )
+        assert np.array_equal(np.float32(feature.data), np.float32(record["features"]))
+        assert list(prediction.labels) == list(clf.labels)
+        assert prediction.label == clf.labels[int(np.argmax(prediction.scores))]
+    finals = [record for record in records if record.get("sample", {}).get("final")]
+    expected = offline(model, home / "test.mcap")
+    assert len(finals) == said["samples"] == 10
+    for record, (label, encoded) in zip(finals, expected, strict=True):
+        assert record["sample"]["label"] == label.label
+        tolerance = 0 if formulation == "direct" else 0.02 * float(encoded.max())
+        assert np.allclose(record["features"], encoded, rtol=0, atol=tolerance)
+        assert record["prediction"] == clf.predict(np.array(record["features"], np.float32))
+    right = sum(record["prediction"] == record["sample"]["label"] for record in finals)
+    assert (said["correct"], said["accuracy"]) == (right, right / 10)
+
+
+@pytest.mark.parametrize("emit", ["event", "500ev", "10ms", "auto"])
+def test_emission_policies_agree_on_what_counts(run, home, tmp_path, emit):
+    lines = tmp_path / "out.jsonl"
+    arguments = ["-m", home / "direct", "--emit", emit, "--json-lines", lines, "--features", "--json"]
+    said = run("replay", home / "test.mcap", *arguments).json
+    records = [json.loads(line) for line in lines.read_text().splitlines()]
+    finals = [r["features"] for r in records if r["sample"]["final"]]
+    expected = offline(Encoder.load(home / "direct"), home / "test.mcap")
+    assert np.array_equal(np.array(finals, np.float32), [encoded for _, encoded in expected])
+    assert "accuracy" not in said
+    if emit == "event":
+        assert said["emissions"] == said["events"] + 10
+
+
+def test_json_lines_on_standard_output(run, home):
+    result = run("replay", home / "test.mcap", "-m", home / "direct", "--emit", "1s", "--json-lines", "-")
+    records = [json.loads(line) for line in result.out.splitlines()]
+    assert len(records) == 10
+    assert result.status == 0
+
+
+def test_the_terminal_shows_samples_and_a_summary(run, home):
+    arguments = ["-m", home / "direct", "-c", home / "direct.clf", "--emit", "1s"]
+    result = run("replay", home / "test.mcap", *arguments)
+    assert "% of" in result.out
+    assert "accuracy" in result.out
+    assert "% of" not in run("replay", home / "test.mcap", *arguments, "-q").out
+
+
+def test_a_split_and_a_speed(run, home):
+    said = run("replay", home / "train.mcap", "-m", home / "direct", "--split", "test", "--json").json
+    assert said["samples"] == 10
+    said = run(
+        "replay", home / "train.mcap", "-m", home / "direct", "--split", "test", "--speed", "1e6", "--json"
+    ).json
+    assert (said["samples"], said["interrupted"]) == (10, False)
+
+
+@pytest.mark.parametrize("start", [[], ["-c", "direct.clf"]])
+def test_learning_online(run, home, start):
+    arguments = ["-m", home / "direct", "--learn-online", "--emit", "1s", "--json"]
+    arguments += [home / part if part.endswith(".clf") else part for part in start]
+    said = run("replay", home / "train.mcap", *arguments).json
+    assert said["samples"] == 40
+    assert 0 <= said["accuracy"] <= 1
+
+
+def test_overwrite(run, home, tmp_path):
+    target = tmp_path / "out.mcap"
+    target.write_bytes(b"mine")
+    arguments = ["replay", home / "test.mcap", "-m", home / "direct", "-o", target, "-q"]
+    assert run(*arguments).status == 2
+    assert target.read_bytes() == b"mine"
+    assert run(*arguments, "--overwrite").status == 0
+    with target.open("rb") as file:
+        assert make_reader(file).get_summary() is not None
+
+
+# --- what is refused
+
+
+def write_messages(path, *messages, topics=("/events",), schema=EventPacket.SCHEMA_NAME):
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for name in topics:
+            channel = writer.register_channel(name, "cdr", writer.register_schema(schema, "ros2msg", b""))
+            for i, data in enumerate(messages):
+                writer.add_message(channel, i, data, i)
+        writer.finish()
+    return path
+
+
+def event_packet(encoding="mono", payload=bytes(8)):
+    return EventPacket(0, "", 34, 34, 0, 0, encoding, False, payload).to_cdr()
+
+
+def changed_model(source, target, *, version=1, arrays=None):
+    with safe_open(source, framework="numpy") as file:
+        header = json.loads(file.metadata()["streamfeat"]) | {"version": version}
+        content = {name: file.get_tensor(name) for name in file.keys()} | (arrays or {})  # noqa: SIM118
+    save_file(content, target, metadata={"streamfeat": json.dumps(header)})
+
+
+@pytest.fixture(scope="module")
+def bad(home, tmp_path_factory):
+    """A folder of files that cannot be used."""
+    bad = tmp_path_factory.mktemp("bad")
+    good = (home / "test.mcap").read_bytes()
+    (bad / "empty").write_bytes(b"")
+    (bad / "cut").write_bytes(good[:60])
+    (bad / "text").write_bytes(b"not an MCAP file at all, but longer than its magic")
+    write_messages(bad / "no_events", b"\0" * 20, schema="std_msgs/msg/String")
+    write_messages(bad / "two_topics", event_packet(), topics=("/left", "/right"))
+    write_messages(bad / "bad_length", event_packet(payload=bytes(7)))
+    write_messages(bad / "unknown_encoding", event_packet("morse"))
+    changed_model(home / "direct", bad / "new_model", version=2)
+    changed_model(home / "direct", bad / "odd_model", arrays={"mean": np.zeros(7, np.float32)})
+    (bad / "cut_model").write_bytes((home / "direct").read_bytes()[:-10])
+    tiny.write_items(
+        bad / "small.mcap",
+        [Label(0, 1000, "cat"), tiny.packet(tiny.steady(0, 1000, 50, resolution=(5, 5)), (5, 5))],
+    )
+    tiny.write_items(bad / "unlabelled.mcap", [tiny.packet(tiny.steady(0, 90_000, 900))])
+    tiny.write_items(bad / "one_class.mcap", tiny.labelled_items(4, names=("cat",)))
+    tiny.write_items(bad / "few.mcap", tiny.labelled_items(4, names=("cat", "dog", "cat", "cat")))
+    items = [
+        Label(i.start_us, i.duration_us, i.label, "test") if isinstance(i, Label) else i
+        for i in tiny.labelled_items(2)
+    ]
+    tiny.write_items(bad / "held_out.mcap", items)
+    tiny.write_items(bad / "silent.mcap", [tiny.packet(make_events([0], [0], [1], [0]), (8, 8))])
+    (bad / "folder").mkdir()
+    (bad / "existing").write_bytes(b"mine")
+    (bad / "data").mkdir()
+    nmnist_folder(bad / "data")
+    return bad
+
+
+REPLAY = ["replay", "{home}/test.mcap", "-m", "{home}/direct"]
+NEW = ["learn", "{home}/train.mcap", "-o", "{bad}/new", *LEARN]
+TRAIN = ["-m", "{home}/direct", "-o", "{bad}/new"]
+
+REFUSALS = {
+    "missing": (["info", "{bad}/missing"], "missing: cannot be opened"),
+    "folder": (["info", "{bad}/folder"], "folder"),
+    "empty": (["info", "{bad}/empty"], "is empty"),
+    "truncated": (["info", "{bad}/cut"], "cut: "),
+    "no mcap": (["info", "{bad}/text"], "is not an MCAP recording"),
+    "no event topic": (["info", "{bad}/no_events"], "no topic carries"),
+    "two event topics": (["info", "{bad}/two_topics"], "choose one of ['/left', '/right']"),
+    "wrong topic": (["info", "{bad}/two_topics", "--topic", "/up"], "no events on topic '/up'"),
+    "packet length": (["info", "{bad}/bad_length"], "message 1"),
+    "unknown encoding": (["info", "{bad}/unknown_encoding"], "morse"),
+    "replay of a missing file": (["replay", "{bad}/missing", "-m", "{home}/direct"], "cannot be opened"),
+    "missing model": (["replay", "{home}/test.mcap", "-m", "{bad}/missing"], "no such file"),
+    "model of another version": (["replay", "{home}/test.mcap", "-m", "{bad}/new_model"], "format version 2"),
+    "model of wrong shape": (["replay", "{home}/test.mcap", "-m", "{bad}/odd_model"], "mean has shape (7,)"),
+    "model cut short": (["replay", "{home}/test.mcap", "-m", "{bad}/cut_model"], "not a readable"),
+    "model that is a classifier": (["replay", "{home}/test.mcap", "-m", "{home}/direct.clf"], "encoder file"),
+    "classifier that is a model": ([*REPLAY, "-c", "{home}/direct"], "classifier file"),
+    "classifier of another model": (
+        [*REPLAY, "-c", "{home}/inverse.clf"],
+        "inverse.clf: was trained with another",
+    ),
+    "existing output": ([*REPLAY, "-o", "{bad}/existing"], "exists already"),
+    "existing lines": ([*REPLAY, "--json-lines", "{bad}/existing"], "exists already"),
+    "existing model": (["learn", "{home}/train.mcap", "-o", "{bad}/existing"], "exists already"),
+    "existing classifier": (
+        ["train", "{home}/train.mcap", "-m", "{home}/direct", "-o", "{bad}/existing"],
+        "exists",
+    ),
+    "existing recording": (["convert", "{bad}/data", "{bad}/existing"], "exists already"),
+    "output in no folder": ([*REPLAY, "-o", "{bad}/no/out.mcap"], "there is no folder"),
+    "output is a folder": ([*REPLAY, "-o", "{bad}/folder", "--overwrite"], "is a folder"),
+    "sensor too small": (["replay", "{bad}/small.mcap", "-m", "{home}/direct"], "5x5 pixels"),
+    "sensor too small to train": (["train", "{bad}/small.mcap", *TRAIN], "5x5 pixels"),
+    "emit": ([*REPLAY, "--emit", "often"], "--emit 'often'"),
+    "speed": ([*REPLAY, "--speed", "-1"], "--speed '-1'"),
+    "split": ([*REPLAY, "--split", "moon"], "no samples of split 'moon'"),
+    "nothing to learn online": (
+        ["replay", "{bad}/unlabelled.mcap", "-m", "{home}/direct", "--learn-online"],
+        "label",
+    ),
+    "formulation": ([*NEW, "--formulation", "sideways"], "formulation is 'sideways'"),
+    "pooling": ([*NEW, "--encoding", "loud"], "encoding is 'loud'"),
+    "no bins": ([*NEW, "--bins", "0"], "bins"),
+    "no window": ([*NEW, "--window-ms", "0"], "window"),
+    "patch": ([*NEW, "--patch", "0"], "patch"),
+    "seed": ([*NEW, "--seed", "-1"], "seed"),
+    "threshold": ([*NEW, "--threshold", "nan"], "threshold"),
+    "too few volumes": ([*NEW, "--volumes", "1"], "two volumes"),
+    "too few volumes found": (
+        ["learn", "{bad}/silent.mcap", "-o", "{bad}/new", "--patch", "8"],
+        "nothing to learn from",
+    ),
+    "nothing but held out": (["learn", "{bad}/held_out.mcap", "-o", "{bad}/new"], "no local volume"),
+    "too much memory": ([*NEW, "--volumes", str(10**15)], "memory"),
+    "payload": (["convert", "{bad}/data", "{bad}/new", "--encoding", "morse"], "morse"),
+    "compression": (["convert", "{bad}/data", "{bad}/new", "--compression", "rar"], "rar"),
+    "no data set": (["convert", "{bad}/missing", "{bad}/new"], "missing"),
+    "gap": (["convert", "{bad}/data", "{bad}/new", "--gap-ms", "nan"], "gap"),
+    "no gap": (["convert", "{bad}/data", "{bad}/new", "--gap-ms", "0"], "gap"),
+    "no labels": (["train", "{bad}/unlabelled.mcap", *TRAIN], "no labelled samples"),
+    "one class": (["train", "{bad}/one_class.mcap", *TRAIN], "1 label"),
+    "class too small": (["train", "{bad}/few.mcap", *TRAIN], "'dog' has 1 training samples"),
+    "all held out": (["train", "{bad}/held_out.mcap", *TRAIN], "held-out"),
+    "folds": (["train", "{home}/train.mcap", *TRAIN, "--folds", "1"], "folds"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_refusals(run, home, bad, name):
+    arguments, reason = REFUSALS[name]
+    before = snapshot(home), snapshot(bad)
+    result = run(*(part.format(home=home, bad=bad) for part in arguments))
+    lines = result.err.splitlines()
+    assert len(lines) == 1, result.err
+    assert lines[0].startswith("error: ")
+    assert reason in lines[0]
+    assert result.status == 2
+    assert result.out == ""
+    assert (snapshot(home), snapshot(bad)) == before
+
+
+def test_markup_and_line_breaks_in_names_are_printed_as_they_are(run, tmp_path):
+    result = run("info", tmp_path / "[red]:smile:\nnext")
+    assert result.err.count("\n") == 1
+    assert "[red]:smile: next" in result.err
+
+
+# --- what is damaged
+
+
+def test_events_that_cannot_be_are_counted(run, home, tmp_path):
+    good = tiny.steady(1_000_000, 1_100_000, 500, resolution=(34, 34))
+    outside = make_events([200, 3], [3, 99], [1, 0], [1_050_000, 1_050_001])
+    back = tiny.steady(0, 1_000, 40, resolution=(34, 34))
+    items = [tiny.packet(part, (34, 34)) for part in (good[:250], outside, good[250:], back)]
+    path = tiny.write_items(tmp_path / "odd.mcap", items)
+    said = run("replay", path, "-m", home / "direct", "--json").json
+    assert (said["events"], said["rejected"], said["late"]) == (500, 2, 40)
+
+
+def test_a_damaged_chunk_costs_only_itself(run, home, tmp_path):
+    path = tmp_path / "damaged.mcap"
+    with RecordingWriter(path, chunk_size=4096, compression="none") as writer:
+        for i in range(40):
+            writer.write_events(tiny.steady(i * 10_000, (i + 1) * 10_000, 200, i, (34, 34)), (34, 34))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    result = run("replay", path, "-m", home / "direct", "--json")
+    assert result.status == 0
+    assert result.json["lost"] > 0
+    assert 8000 - 3 * 600 < result.json["events"] < 8000
+    assert "lost:" in result.err
+    result = run("replay", path, "-m", home / "direct", "--json-lines", "-", "--emit", "1s")
+    assert "lost:" in result.err
+    assert run("info", path, "--json").json["integrity"] == "damaged"
+
+
+# --- interruption
+
+
+def start(*arguments):
+    code = "from streamfeat.cli import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+
+
+def test_an_interrupted_replay_keeps_what_it_read(home, tmp_path):
+    target = tmp_path / "out.mcap"
+    arguments = ["-m", home / "direct", "-c", home / "direct.clf", "--emit", "20ms", "--speed", "0.2"]
+    with start("replay", home / "test.mcap", *arguments, "-o", target) as process:
+        assert "% of 1" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert (process.returncode, err) == (130, "")
+    table = out[out.index("replayed") :].splitlines()
+    summary = dict(line.strip().split(maxsplit=1) for line in table[1:])
+    assert summary["interrupted"] == "True"
+    assert 0 < int(summary["samples"]) < 10
+    with target.open("rb") as file:
+        counts = make_reader(file).get_summary().statistics.message_count
+    assert counts > 0
+    assert list(tmp_path.iterdir()) == [target]
