@@ -40,6 +40,7 @@ Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
 
 _INT16, _INT32 = 2**15 - 1, 2**31 - 1
+_LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +106,9 @@ class Encoder:
         Raises:
             InputError: shapes do not fit, a value is not finite, or an integer could overflow.
         """
-        filters32 = np.ascontiguousarray(filters, np.float32)
-        whitening32 = np.ascontiguousarray(whitening, np.float32)
-        mean32 = np.ascontiguousarray(mean, np.float32)
+        filters32 = np.array(filters, np.float32, order="C")  # copies, because they are made read-only
+        whitening32 = np.array(whitening, np.float32, order="C")
+        mean32 = np.array(mean, np.float32, order="C")
         _check_parameters(geometry, formulation, encoding, threshold, filters32, whitening32, mean32)
         operator = _quantise(
             geometry, formulation, encoding, threshold, filters32, whitening32, mean32, eps, gap
@@ -200,7 +201,7 @@ class Encoder:
         arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
         try:
             return cls._from_parts(arrays, header)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: not a usable model: {one_line(error)}; learn it again") from error
 
     @classmethod
@@ -249,16 +250,16 @@ def _check_parameters(
         raise InputError(f"formulation is {formulation!r}, it must be 'direct' or 'inverse'")
     if encoding not in ENCODINGS:
         raise InputError(f"encoding is {encoding!r}, it must be one of {', '.join(ENCODINGS)}")
-    if not (math.isfinite(threshold) and threshold >= 0) or (formulation == "inverse" and threshold == 0):
-        raise InputError(f"threshold is {threshold}, it must be finite and above zero")
+    if not 0 <= threshold <= _LARGEST or (formulation == "inverse" and threshold == 0):
+        raise InputError(f"threshold is {threshold}, it must be above zero and at most {_LARGEST:g}")
     if filters.ndim != 2 or filters.shape[0] < 1 or filters.shape[1] != d:
         raise InputError(f"filters have shape {filters.shape}, expected (K, {d})")
     for name, array, shape in (("whitening", whitening, (d, d)), ("mean", mean, (d,))):
         if array.shape != shape:
             raise InputError(f"{name} has shape {array.shape}, expected {shape}")
     for name, array in (("filters", filters), ("whitening", whitening), ("mean", mean)):
-        if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise InputError(f"{name} must be finite float32")
+        if array.dtype != np.float32 or not (np.abs(array) <= _LARGEST).all():
+            raise InputError(f"{name} must be finite float32 of at most {_LARGEST:g}")
 
 
 def _fixed_fields(
@@ -320,9 +321,8 @@ def _quantise(
         form = (form + form.T) / 2
         row = (white @ mean) @ centred
         # The largest scale at which neither an entry nor any sum of them can overflow.
-        quadratic_scale = max(
-            float(np.abs(form).max()) / _INT32, float(np.abs(form).sum()) * geometry.max_count**2 / 2.0**61
-        )
+        sum_of_form = float(np.abs(form).sum()) * geometry.max_count**2
+        quadratic_scale = max(float(np.abs(form).max()) / _INT32, sum_of_form / 2.0**61, 1e-30)
         linear_scale = max(float(np.abs(row).max()) / _INT32, 1e-30)
         quadratic = np.rint(form / quadratic_scale).astype(np.int32)
         linear = np.rint(row / linear_scale).astype(np.int32)
@@ -356,11 +356,11 @@ def _check_ranges(geometry: Geometry, operator: Operator) -> None:
     for name, (dtype, shape) in expected.items():
         array = getattr(operator, name)
         if array.dtype != dtype or array.shape != shape:
-            raise InputError(
-                f"{name} is {array.dtype}{list(array.shape)}, expected {np.dtype(dtype)}{list(shape)}"
-            )
-    if not (operator.eps > 0 and operator.scale > 0 and 0 < operator.gap < 1):
-        raise InputError("eps, scale and gap must be above zero, and gap below one")
+            raise InputError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}")
+    if not (0 < operator.eps < math.inf and operator.scale > 0 and 0 < operator.gap < 1):
+        raise InputError("eps, scale and gap must be finite and above zero, and gap below one")
+    if operator.columns[:, operator.n_filters :].any():
+        raise InputError(f"columns holds more filters than {operator.n_filters}")
     if not (np.isfinite(operator.offset).all() and np.isfinite(operator.square_norms).all()):
         raise InputError("offset and square_norms must be finite")
     magnitude = np.abs(operator.columns.astype(np.int64))

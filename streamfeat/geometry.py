@@ -46,7 +46,7 @@ class Geometry:
         }
         for name, most in upper.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and 1 <= value <= most):
+            if not (type(value) is int and 1 <= value <= most):
                 raise InputError(f"geometry: {name} is {value!r}, it must be an integer from 1 to {most}")
 
     @property

@@ -1,0 +1,438 @@
+"""Models: made, saved, loaded, quantised as finely as promised, and refused in one line if not right."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+from streams import KINDS, random_encoder, random_events
+
+from streamfeat import safe_arrays
+from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
+from streamfeat.errors import InputError
+from streamfeat.files import replacing, write_atomically
+from streamfeat.geometry import Geometry
+
+ids = "-".join
+
+GEOMETRY = Geometry(patch=3, stride=2, n_bins=2, bin_us=1000, max_count=2)
+RESOLUTION = (9, 12)
+EVENTS = random_events(np.random.default_rng(1), GEOMETRY, RESOLUTION, 150, n_windows=1)
+
+
+def known_encoder(kind=("direct", "soft"), **parameters):
+    return random_encoder(np.random.default_rng(0), GEOMETRY, 5, *kind, **parameters)
+
+
+def refused(function, *arguments, match=None, **parameters):
+    """The one line that says why."""
+    with pytest.raises(InputError, match=match) as error:
+        function(*arguments, **parameters)
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) > 15
+    return message
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "model.safetensors"
+    known_encoder().save(path)
+    return path
+
+
+def rewrite(path, arrays=None, header=None, text=None):
+    """Change some arrays (None takes one away) and header fields of a saved model."""
+    stored = load_file(path) | (arrays or {})
+    with safe_arrays.safe_open(path, framework="numpy") as file:
+        old = json.loads(file.metadata()["streamfeat"])
+    new = json.dumps(old | (header or {})) if text is None else text
+    save_file({k: v for k, v in stored.items() if v is not None}, path, metadata={"streamfeat": new})
+
+
+# There and back
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_a_saved_model_is_the_same_model(kind, tmp_path):
+    encoder = known_encoder(kind, provenance={"seed": 3, "data": ["a", "b"]})
+    path = tmp_path / "model.safetensors"
+    encoder.save(path)
+    loaded = Encoder.load(str(path))
+    assert loaded.fingerprint == encoder.fingerprint
+    assert (loaded.geometry, loaded.formulation, loaded.encoding) == (GEOMETRY, *kind)
+    assert loaded.threshold == encoder.threshold
+    assert loaded.provenance == encoder.provenance
+    for name, mine in encoder.operator._asdict().items():
+        np.testing.assert_array_equal(getattr(loaded.operator, name), mine, err_msg=name)
+    for name in ("filters", "whitening", "mean"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(encoder, name), strict=True)
+    features = encoder.encode(EVENTS, RESOLUTION)
+    assert features.any()
+    np.testing.assert_array_equal(loaded.encode(EVENTS, RESOLUTION), features, strict=True)
+
+
+def test_saving_twice_gives_the_same_bytes(saved):
+    first = saved.read_bytes()
+    Encoder.load(saved).save(saved)
+    assert saved.read_bytes() == first
+
+
+def test_the_fingerprint_tells_models_apart():
+    encoder = known_encoder()
+    others = [
+        known_encoder(("direct", "split")),
+        known_encoder(("inverse", "soft")),
+        known_encoder(threshold=0.11),
+        known_encoder(eps=0.02),
+        random_encoder(np.random.default_rng(0), dataclasses.replace(GEOMETRY, bin_us=1001), 5),
+        random_encoder(np.random.default_rng(2), GEOMETRY, 5),
+    ]
+    assert len({e.fingerprint for e in (encoder, *others)}) == 1 + len(others)
+    assert known_encoder(provenance={"a": 1}).fingerprint == encoder.fingerprint
+
+
+def test_a_model_cannot_be_changed():
+    encoder = known_encoder(("inverse", "soft"))
+    for array in (encoder.filters, encoder.operator.columns, encoder.operator.gram):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+def test_build_leaves_its_arguments_alone():
+    d = GEOMETRY.entries
+    arrays = {"filters": np.eye(d, dtype=np.float32), "whitening": np.eye(d), "mean": np.zeros(d)}
+    before = {name: array.copy() for name, array in arrays.items()}
+    encoder = Encoder.build(GEOMETRY, formulation="direct", encoding="soft", threshold=0.1, **arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, before[name])
+        array[0] = 7
+    assert encoder.filters[0, 0] == 1
+
+
+# Quantisation
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_the_operator_is_within_half_a_step_of_what_it_stands_for(kind):
+    encoder = known_encoder(kind)
+    operator, d, k = encoder.operator, GEOMETRY.entries, 5
+    centring = np.eye(d) - 1 / d
+    whitening = encoder.whitening.astype(np.float64)
+    exact = encoder.filters.astype(np.float64) @ whitening @ centring
+    columns = operator.columns.astype(np.float64) * operator.scale
+    assert np.abs(columns[:, :k].T - exact).max() <= operator.scale / 2 * (1 + 1e-9)
+    assert not operator.columns[:, k:].any()
+    assert np.abs(operator.columns).max() == 2**15 - 1
+    if operator.quadratic.size:
+        form = centring @ whitening.T @ whitening @ centring
+        assert np.abs(operator.quadratic * operator.quadratic_scale - form).max() <= operator.quadratic_scale
+        row = (whitening @ encoder.mean) @ whitening @ centring
+        assert np.abs(operator.linear * operator.linear_scale - row).max() <= operator.linear_scale
+        assert operator.constant == pytest.approx(np.square(whitening @ encoder.mean).sum())
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_volumes_of_one_entry_have_nothing_but_a_mean(kind):
+    """One entry less its mean is zero: nothing is left to project, whatever the count."""
+    geometry = Geometry(patch=1, stride=1, n_bins=1, bin_us=10)
+    encoder = random_encoder(np.random.default_rng(0), geometry, 3, *kind)
+    assert not encoder.operator.columns.any()
+    events = EVENTS[:5]
+    assert np.isfinite(encoder.encode(events, RESOLUTION)).all()
+
+
+# What cannot be built
+
+D = GEOMETRY.entries
+
+
+def build(geometry=GEOMETRY, **parameters):
+    fields = {
+        "formulation": "direct",
+        "encoding": "soft",
+        "threshold": 0.1,
+        "filters": np.eye(D)[:5],
+        "whitening": np.eye(D),
+        "mean": np.zeros(D),
+    }
+    return Encoder.build(geometry, **(fields | parameters))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "says"),
+    [
+        ({"formulation": "forward"}, "formulation is 'forward', it must be 'direct' or 'inverse'"),
+        ({"encoding": "hard"}, "encoding is 'hard', it must be one of soft, split, triangle"),
+        ({"threshold": -0.1}, "threshold is -0.1"),
+        ({"threshold": float("nan")}, "threshold is nan"),
+        ({"threshold": float("inf")}, "threshold is inf"),
+        ({"threshold": 0.0, "formulation": "inverse"}, "threshold is 0.0"),
+        ({"threshold": 1e36}, "threshold is 1e"),
+        ({"threshold": 1e36, "formulation": "inverse"}, "threshold is 1e"),
+        ({"filters": np.zeros((5, D + 1))}, r"filters have shape \(5, 19\), expected \(K, 18\)"),
+        ({"filters": np.zeros((0, D))}, "filters have shape"),
+        ({"filters": np.zeros(D)}, "filters have shape"),
+        ({"whitening": np.eye(D + 1)}, r"whitening has shape \(19, 19\), expected \(18, 18\)"),
+        ({"mean": np.zeros((D, 1))}, "mean has shape"),
+        ({"filters": np.full((5, D), np.nan)}, "filters must be finite"),
+        ({"whitening": np.full((D, D), np.inf)}, "whitening must be finite"),
+        ({"mean": np.full(D, np.nan)}, "mean must be finite"),
+        ({"eps": 0.0}, "eps, scale and gap"),
+        ({"eps": float("nan")}, "eps, scale and gap"),
+        ({"eps": float("inf")}, "eps, scale and gap"),
+        ({"gap": 0.0}, "eps, scale and gap"),
+        ({"gap": 1.0}, "eps, scale and gap"),
+        ({"filters": 1e6 * np.eye(D)}, "a code could reach"),
+        ({"filters": 1e30 * np.eye(D)}, "finite|squared length|code could reach"),
+        ({"filters": 1e30 * np.eye(D), "formulation": "inverse"}, "finite|squared|code could reach"),
+        ({"whitening": 1e30 * np.eye(D), "encoding": "triangle"}, "whitening must be finite"),
+        ({"mean": np.full(D, 1e30)}, "mean must be finite"),
+        ({"mean": np.full(D, 1e6)}, "a code could reach"),
+        (
+            {name: np.full((D, D)[: 1 + (name != "mean")], 1e8) for name in ("filters", "whitening", "mean")},
+            "code could reach",
+        ),
+    ],
+)
+def test_what_is_no_encoder_is_refused(parameters, says):
+    refused(build, match=says, **parameters)
+
+
+def test_an_integer_that_could_overflow_is_refused_with_the_arithmetic():
+    geometry = dataclasses.replace(GEOMETRY, max_count=30_000)
+    filters = np.tile([1.0, -1.0], (5, D // 2))
+    message = refused(build, geometry, filters=filters)
+    assert f"max_count 30000 x {D * 32767}" in message
+    assert f"= {30_000 * D * 32767}, which is not below 2^31; lower max_count" in message
+    largest = (2**31 - 1) // (D * 32767)
+    build(dataclasses.replace(GEOMETRY, max_count=largest), filters=filters)
+    refused(build, dataclasses.replace(GEOMETRY, max_count=largest + 1), filters=filters)
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Geometry)])
+@pytest.mark.parametrize("value", [0, -1, 2**41, 1.0, "3", None, True])
+def test_a_geometry_out_of_range_is_refused(name, value):
+    message = refused(Geometry, **{name: value})
+    assert name in message
+
+
+# What cannot be loaded
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    assert "no such file" in refused(Encoder.load, tmp_path / "nothing.safetensors")
+
+
+def test_a_folder_is_refused(tmp_path):
+    refused(Encoder.load, tmp_path)
+
+
+def test_a_file_cut_short_anywhere_is_refused(saved):
+    whole = saved.read_bytes()
+    for size in [0, 1, 7, 8, 9, 100, len(whole) // 2, len(whole) - 1]:
+        saved.write_bytes(whole[:size])
+        assert str(saved) in refused(Encoder.load, saved)
+    saved.write_bytes(whole + b"\0")
+    refused(Encoder.load, saved)
+
+
+def test_random_bytes_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "model.safetensors"
+    for size in (8, 64, 4096):
+        for _ in range(10):
+            path.write_bytes(rng.bytes(size))
+            refused(Encoder.load, path)
+            path.write_bytes(size.to_bytes(8, "little") + rng.bytes(size))
+            refused(Encoder.load, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (name, change)
+        for name in ("filters", "whitening", "mean", "columns", "offset", "square_norms")
+        for change in ("missing", "short", "wide", "float64", "int8")
+    ]
+    + [(name, "nan") for name in ("filters", "whitening", "mean", "offset", "square_norms")],
+)
+def test_arrays_of_another_shape_or_kind_are_refused(saved, name, change):
+    array = load_file(saved)[name]
+    nan = np.full(array.shape, np.nan, np.float32)
+    to = {
+        "missing": lambda: None,
+        "short": lambda: array[:-1].copy(),
+        "wide": lambda: array[..., None].copy(),
+        "float64": lambda: array.astype(np.float64),
+        "int8": lambda: array.astype(np.int8),
+        "nan": lambda: nan,
+    }
+    rewrite(saved, {name: to[change]()})
+    message = refused(Encoder.load, saved)
+    assert str(saved) in message
+    assert name in message
+
+
+HUGE = 10**400  # an integer in JSON, and no float
+
+
+def short(value):
+    return ascii(value)[:60]
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"format": "something-else"},
+        {"format": None},
+        {"version": 2},
+        {"version": "1\n2"},
+        {"geometry": None},
+        {"geometry": []},
+        {"geometry": {"patch": 3}},
+        {"geometry": dataclasses.asdict(GEOMETRY) | {"more": 1}},
+        {"geometry": dataclasses.asdict(GEOMETRY) | {"max_count": 30_000}},
+        {"geometry": dataclasses.asdict(GEOMETRY) | {"max_count": True}},
+        {"geometry": dataclasses.asdict(GEOMETRY) | {"n_bins": HUGE}},
+        {"geometry": dataclasses.asdict(GEOMETRY) | {"n_bins": "2\n"}},
+        {"formulation": 3},
+        {"formulation": ["direct"]},
+        {"encoding": {}},
+        {"encoding": "triangle"},
+        {"encoding": "soft\nhard"},
+        {"threshold": "much"},
+        {"threshold": None},
+        {"threshold": HUGE},
+        {"threshold": 1e300},
+        {"threshold": float("nan")},
+        {"scalars": None},
+        {"scalars": {}},
+        {"scalars": {"scale": 1.0}},
+        {"provenance": 3},
+    ],
+    ids=short,
+)
+def test_a_header_that_is_not_right_is_refused(saved, header):
+    rewrite(saved, header=header)
+    assert str(saved) in refused(Encoder.load, saved)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), HUGE, None, "one", [1]], ids=short)
+@pytest.mark.parametrize("name", ["scale", "eps", "quadratic_scale", "linear_scale", "constant", "gap"])
+def test_a_scalar_that_is_not_right_is_refused(tmp_path, name, value):
+    saved = tmp_path / "model.safetensors"
+    known_encoder(("direct", "triangle")).save(saved)
+    with safe_arrays.safe_open(saved, framework="numpy") as file:
+        scalars = json.loads(file.metadata()["streamfeat"])["scalars"]
+    rewrite(saved, header={"scalars": scalars | {name: value}})
+    if name == "constant" and value == 0.0:
+        Encoder.load(saved)  # a mean of zero
+    else:
+        assert str(saved) in refused(Encoder.load, saved)
+
+
+@pytest.mark.parametrize("text", ["", "{", "3", "null", "[]", '"text"', "[" * 10**5, "9" * 5000])
+def test_a_header_that_is_no_json_object_is_refused(saved, text):
+    rewrite(saved, text=text)
+    assert str(saved) in refused(Encoder.load, saved)
+
+
+def test_a_safetensors_file_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    save_file({"weights": np.zeros(3)}, path)
+    assert "not a streamfeat-encoder file" in refused(Encoder.load, path)
+
+
+def test_atoms_too_long_for_their_inner_products_are_refused(tmp_path):
+    saved = tmp_path / "model.safetensors"
+    known_encoder(("inverse", "soft")).save(saved)
+    filters = load_file(saved)["filters"]
+    filters[0, 0] = 1e30  # finite, its square is not
+    rewrite(saved, {"filters": filters})
+    refused(Encoder.load, saved)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_a_model_with_damaged_bytes_is_refused_or_runs(kind, tmp_path):
+    path = tmp_path / "model.safetensors"
+    known_encoder(kind, gap=1e-3).save(path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(3)
+    outcomes = {"refused": 0, "runs": 0}
+    for _ in range(40):
+        damaged = bytearray(whole)
+        # Half of the damage is in the header, most bytes are in the arrays.
+        end = 8 + int.from_bytes(whole[:8], "little") if rng.random() < 0.5 else len(whole)
+        for place in rng.integers(0, end, rng.integers(1, 4)):
+            damaged[place] ^= 1 << rng.integers(0, 8)
+        path.write_bytes(damaged)
+        try:
+            encoder = Encoder.load(path)
+            engine = Engine(encoder, RESOLUTION)
+        except InputError as error:
+            outcomes["refused"] += "\n" not in str(error)
+            continue
+        engine.feed(EVENTS)
+        features = engine.features()
+        engine.feed(EVENTS[:20])
+        assert engine.features().shape == features.shape == (encoder.n_features,)
+        assert np.isfinite(features).all()
+        outcomes["runs"] += 1
+    assert sum(outcomes.values()) == 40
+    assert min(outcomes.values()) > 3
+
+
+# Files appear whole or not at all
+
+
+def only(folder):
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_failed_save_leaves_the_earlier_model(saved, monkeypatch):
+    before = saved.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("streamfeat.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        known_encoder(("direct", "split")).save(saved)
+    assert saved.read_bytes() == before
+    assert only(saved.parent) == [saved.name]
+
+
+def test_what_no_json_can_hold_leaves_the_earlier_model(saved):
+    before = saved.read_bytes()
+    with pytest.raises(TypeError):
+        known_encoder(provenance={"when": object()}).save(saved)
+    assert saved.read_bytes() == before
+    assert only(saved.parent) == [saved.name]
+
+
+def test_a_block_that_fails_leaves_nothing(tmp_path):
+    target = tmp_path / "file"
+    target.write_text("before")
+
+    def write_half():
+        with replacing(target) as temporary:
+            temporary.write_text("half of it")
+            assert target.read_text() == "before"
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_half()
+    assert target.read_text() == "before"
+    assert only(tmp_path) == ["file"]
+    write_atomically(target, b"after")
+    assert target.read_bytes() == b"after"
+    assert only(tmp_path) == ["file"]
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path):
+    target = tmp_path / "no" / "model.safetensors"
+    assert "cannot write there" in refused(known_encoder().save, Path(target))
