@@ -1,0 +1,375 @@
+"""The engine's contract: what it takes, what it refuses, what it hands out, and that it allocates nothing."""
+
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+from kernel_table import assert_certified
+from streams import EXACT_KINDS, KINDS, LASSO_KINDS, Case, random_events
+
+from streamfeat.engine import Engine, EngineStats
+from streamfeat.errors import InputError
+from streamfeat.events import EVENT_DTYPE, make_events
+from streamfeat.geometry import Geometry
+
+ids = "-".join
+
+GEOMETRY = Geometry(patch=4, stride=3, n_bins=3, bin_us=1000, downsample=2, max_count=2)
+
+
+def known_case(kind=("direct", "soft"), geometry=GEOMETRY, resolution=(31, 42)):
+    return Case(geometry, resolution, 33, *kind, 0.1, 3)
+
+
+def some_events(case, n=300, seed=0):
+    return random_events(np.random.default_rng(seed), case.geometry, case.resolution, n)
+
+
+def one_line(error):
+    return "\n" not in str(error.value) and len(str(error.value)) > 10
+
+
+# What is fed
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        None,
+        [(1, 1, 1, 1)],
+        np.zeros(3),
+        np.zeros(3, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")]),  # packed
+        np.zeros(3, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<f8")]),
+        np.zeros(3, EVENT_DTYPE.newbyteorder(">")),
+        np.zeros((2, 3), EVENT_DTYPE),
+        np.zeros((), EVENT_DTYPE),
+    ],
+    ids=["none", "list", "floats", "packed", "float time", "big-endian", "two-dimensional", "scalar"],
+)
+def test_what_is_no_batch_is_refused_and_changes_nothing(batch):
+    engine = known_case().engine()
+    engine.feed(some_events(known_case()))
+    features, stats = engine.features(), engine.stats()
+    with pytest.raises(InputError) as error:
+        engine.feed(batch)
+    assert one_line(error)
+    np.testing.assert_array_equal(engine.features(), features)
+    assert engine.stats() == stats
+
+
+def read_only(events):
+    events = events.copy()
+    events.flags.writeable = False
+    return events
+
+
+def strided(events):
+    return np.repeat(events, 2)[::2]
+
+
+def backwards(events):
+    return events[::-1].copy()[::-1]
+
+
+def unaligned(events):
+    room = bytearray(events.nbytes + 1)
+    room[1:] = events.tobytes()
+    return np.frombuffer(room, EVENT_DTYPE, offset=1)
+
+
+@pytest.mark.parametrize("form", [read_only, strided, backwards, unaligned])
+def test_batches_of_any_memory_layout_mean_the_same(form):
+    case = known_case()
+    events = some_events(case)
+    expected, engine = case.engine(), case.engine()
+    expected.feed(events)
+    before = form(events).tolist()
+    batch = form(events)
+    engine.feed(batch)
+    assert batch.tolist() == before
+    np.testing.assert_array_equal(engine.features(), expected.features(), strict=True)
+
+
+def test_hostile_values_are_rejected_and_change_nothing():
+    case = known_case()
+    engine = case.engine()
+    engine.feed(make_events([5], [5], [1], [0]))
+    features = engine.features()
+    height, width = case.resolution
+    hostile = [
+        (width, 0, 1, 0),
+        (0, height, 1, 0),
+        (65535, 65535, 1, 0),
+        (0, 0, -1, 0),
+        (0, 0, 2, 0),
+        (0, 0, -32768, 0),
+        (0, 0, 1, 2**63 - 1),
+        (0, 0, 1, -(2**63)),
+        (0, 0, 1, 2**62),
+        (0, 0, 1, -(2**62)),
+    ]
+    engine.feed(np.array(hostile, EVENT_DTYPE))
+    assert engine.stats() == EngineStats(1, 0, len(hostile), 0, 0, 1, 1)
+    np.testing.assert_array_equal(engine.features(), features)
+
+
+def test_a_jump_to_the_end_of_time_empties_the_window_and_stays_there():
+    case = known_case()
+    engine = case.engine()
+    engine.feed(some_events(case))
+    engine.feed(make_events([5], [5], [1], [2**62 - 1]))
+    expected = case.encoder.encode(make_events([5], [5], [1], [2**62 - 1]), case.resolution, origin_us=0)
+    np.testing.assert_array_equal(engine.features(), expected)
+    with pytest.raises(InputError) as error:
+        engine.advance(2**62)
+    assert one_line(error)
+
+
+def test_a_sensor_too_small_for_a_volume_is_refused():
+    case = known_case(resolution=(8, 6))
+    with pytest.raises(InputError, match="6x8 pixels is 3x4 after downsample 2, too small") as error:
+        case.engine()
+    assert one_line(error)
+    with pytest.raises(InputError, match="too small"):
+        case.encoder.encode(make_events([], [], [], []), (8, 6))
+
+
+# Stream time
+
+
+def test_going_back_in_time_does_nothing():
+    case = known_case()
+    engine = case.engine()
+    engine.feed(some_events(case))
+    features, stats = engine.features(), engine.stats()
+    for t_us in (0, -(10**9), -(2**62) + 1):
+        engine.advance(t_us)
+    np.testing.assert_array_equal(engine.features(), features)
+    assert engine.stats() == stats
+
+
+def test_time_passes_by_bins_from_the_origin():
+    case = known_case()
+    engine = case.engine(origin_us=300)
+    engine.feed(make_events([5], [5], [1], [299]))  # the last moment of bin -1
+    engine.advance(299 + 2000)
+    assert engine.features().any()
+    engine.advance(300 + 2000)
+    assert not engine.features().any()
+    assert engine.stats().rolls == 3
+
+
+def test_offline_windows_end_where_they_are_told():
+    case = known_case()
+    events = some_events(case)
+    engine = case.engine()
+    engine.feed(events[events["t"] < 500])
+    engine.advance(1700)
+    engine.feed(events[(events["t"] >= 500) & (events["t"] < 2000)])
+    offline = case.encoder.encode(events[events["t"] < 2000], case.resolution, origin_us=0, t_us=1999)
+    np.testing.assert_array_equal(engine.features(), offline)
+    # Events after the window are no part of it.
+    later = case.encoder.encode(events, case.resolution, origin_us=0, t_us=1999)
+    np.testing.assert_array_equal(later, offline)
+
+
+def test_offline_bins_start_at_the_first_event_if_not_told():
+    case = known_case()
+    events = some_events(case)
+    good = (events["x"] < 42) & (events["y"] < 31) & (events["p"] < 2)
+    first = int(events["t"][good].min())
+    np.testing.assert_array_equal(
+        case.encoder.encode(events, case.resolution),
+        case.encoder.encode(events, case.resolution, origin_us=first, t_us=int(events["t"][good].max())),
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_restart_forgets_events_and_keeps_what_was_counted(kind):
+    case = known_case(kind)
+    engine, fresh = case.engine(), case.engine(origin_us=777)
+    events = some_events(case)
+    engine.feed(events)
+    engine.features()
+    engine.feed(events)  # not read: entries are waiting
+    counted = engine.stats()
+    engine.restart(777)
+    assert not engine.features().any()
+    assert not engine.codes().any()
+    assert engine.stats().events == counted.events
+    for e in (engine, fresh):
+        e.feed(events)
+    np.testing.assert_array_equal(engine.features(), fresh.features(), strict=True)
+    np.testing.assert_array_equal(engine.snapshot().counts, fresh.snapshot().counts, strict=True)
+
+
+# Snapshots
+
+
+@pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
+@pytest.mark.parametrize("is_read", [False, True])
+def test_a_restored_engine_goes_on_with_the_same_bits(kind, is_read):
+    case = known_case(kind)
+    engine, other = case.engine(origin_us=5), case.engine()
+    first, second = np.array_split(some_events(case), 2)
+    engine.feed(first)
+    if is_read:
+        engine.features()
+    other.feed(second)  # something to be forgotten
+    other.features()
+    snapshot = engine.snapshot()
+    engine.feed(second)  # a snapshot is a copy
+    other.restore(snapshot)
+    assert other.stats().events <= len(first)
+    other.feed(second)
+    np.testing.assert_array_equal(other.features(), engine.features(), strict=True)
+    np.testing.assert_array_equal(other.codes(), engine.codes(), strict=True)
+    mine, theirs = other.stats(), engine.stats()
+    counted = ("events", "late", "rejected", "saturated", "rolls", "active_volumes")
+    assert [getattr(mine, name) for name in counted] == [getattr(theirs, name) for name in counted]
+
+
+@pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)
+def test_a_restored_engine_goes_on_within_the_gap(kind):
+    case = known_case(kind)
+    engine, other = case.engine(), case.engine()
+    first, second = np.array_split(some_events(case), 2)
+    engine.feed(first)
+    engine.features()
+    other.restore(engine.snapshot())
+    np.testing.assert_array_equal(other.snapshot().atoms, engine.snapshot().atoms)
+    other.feed(second)
+    other.features()
+    assert_certified(case.encoder.operator, other._state)
+
+
+def test_a_snapshot_of_an_engine_that_saw_nothing_is_an_empty_engine():
+    case = known_case()
+    engine = case.engine()
+    snapshot = engine.snapshot()
+    engine.feed(some_events(case))
+    engine.features()
+    engine.restore(snapshot)
+    assert not engine.features().any()
+    assert engine.stats() == case.engine().stats()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        known_case(resolution=(31, 50)),
+        known_case(geometry=Geometry(patch=4, stride=3, n_bins=4, bin_us=1000, downsample=2, max_count=2)),
+        known_case(("inverse", "soft")),
+    ],
+    ids=["sensor", "bins", "formulation"],
+)
+def test_a_snapshot_of_another_geometry_is_refused_and_changes_nothing(other):
+    engine = known_case().engine()
+    engine.feed(some_events(known_case()))
+    features = engine.features()
+    with pytest.raises(InputError) as error:
+        engine.restore(other.engine().snapshot())
+    assert one_line(error)
+    np.testing.assert_array_equal(engine.features(), features)
+
+
+# What is read
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_features_are_the_codes_summed_over_quadrants(kind):
+    case = known_case(kind)
+    engine = case.engine()
+    engine.feed(some_events(case))
+    codes = engine.codes()
+    rows, columns = engine.grid_shape
+    assert codes.shape == (rows, columns, 33)
+    assert codes.dtype == np.float32
+    assert (rows, columns) == (5, 6)
+    codes = codes.astype(np.float64)
+    if kind[1] == "split":
+        codes = np.concatenate([codes.clip(0), (-codes).clip(0)], axis=2)
+    # An odd row in the middle belongs to the top.
+    quadrants = [codes[:3, :3], codes[:3, 3:], codes[3:, :3], codes[3:, 3:]]
+    expected = np.concatenate([q.sum(axis=(0, 1)) for q in quadrants]).astype(np.float32)
+    np.testing.assert_array_equal(engine.features(), expected, strict=True)
+    assert all(q.any() for q in quadrants)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_what_is_handed_out_is_a_copy(kind):
+    engine = known_case(kind).engine()
+    engine.feed(some_events(known_case(kind)))
+    handed_out = [engine.features(), engine.codes(), engine.snapshot().counts, engine.snapshot().atoms]
+    before = engine.features(), engine.codes()
+    for array in handed_out:
+        array[:] = 77
+    np.testing.assert_array_equal(engine.features(), before[0])
+    np.testing.assert_array_equal(engine.codes(), before[1])
+
+
+def test_stats_count_what_happened():
+    case = known_case()
+    engine = case.engine()
+    assert engine.stats() == EngineStats(0, 0, 0, 0, 0, 0, 0)
+    same_pixel = make_events([0] * 3, [0] * 3, [1] * 3, [0] * 3)  # max_count is 2: the third saturates
+    engine.feed(same_pixel)
+    assert engine.stats() == EngineStats(3, 0, 0, 1, 0, 0, 0)
+    engine.features()
+    assert engine.stats() == EngineStats(3, 0, 0, 1, 0, 1, 1)
+    engine.features()  # nothing is dirty
+    assert engine.stats() == EngineStats(3, 0, 0, 1, 0, 1, 1)
+    engine.feed(make_events([0], [0], [0], [1]))  # back to two: clipped, it was two
+    assert engine.stats().saturated == 2
+    engine.feed(make_events([0, 0], [0, 0], [0, 1], [1, 1]))  # down and up: nothing changes in the end
+    engine.features()
+    assert engine.stats() == EngineStats(6, 0, 0, 2, 0, 1, 1)
+    engine.feed(make_events([99, 0, 0], [0, 0, 0], [1, 1, 1], [1, 5000, 1]))
+    engine.features()
+    assert engine.stats() == EngineStats(7, 1, 1, 2, 5, 1, 2)
+
+
+def test_saturation_is_remembered_beyond_the_clip():
+    """Counts are exact and only what is read is clipped: five ON and three OFF are two ON."""
+    case = known_case()
+    engine, plain = case.engine(), case.engine()
+    engine.feed(make_events([4] * 8, [4] * 8, [1] * 5 + [0] * 3, range(8)))
+    plain.feed(make_events([4] * 2, [4] * 2, [1] * 2, [0] * 2))
+    np.testing.assert_array_equal(engine.features(), plain.features())
+
+
+# Memory
+
+
+@pytest.mark.parametrize("kind", [("direct", "split"), ("inverse", "soft")], ids=ids)
+def test_nothing_is_allocated_after_warm_up(kind):
+    case = known_case(kind)
+    engine = Engine(case.encoder, case.resolution)
+    batches = [some_events(case, 2000, seed) for seed in range(4)]
+    for i, batch in enumerate(batches):
+        batch["t"] += i * 2 * case.geometry.window_us
+
+    def work():
+        for batch in batches:
+            engine.feed(batch)
+            engine.advance(int(batch["t"][-1]) + case.geometry.bin_us)
+            engine._update()
+
+    work()
+    addresses = [array.ctypes.data for array in engine._state]
+    work()
+    blocks = sys.getallocatedblocks()
+    tracemalloc.start()
+    try:
+        start, _ = tracemalloc.get_traced_memory()
+        for _ in range(10):
+            work()
+        end, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert [array.ctypes.data for array in engine._state] == addresses
+    # A batch has 32,000 bytes; what is left are a few Python integers and the call itself.
+    assert peak - start < 4096
+    assert end - start < 1024
+    assert sys.getallocatedblocks() - blocks < 100
