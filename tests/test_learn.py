@@ -196,6 +196,13 @@ def test_dictionary_objective_and_codes_are_those_of_the_lasso():
     assert np.array_equal(again.objective_[:6], learner.objective_)
 
 
+def test_atoms_are_updated_within_the_unit_ball():
+    gram, cross = np.diag([4.0, 1.0, 0.0]), np.diag([1.0, 3.0, 5.0])
+    atoms = DictionaryLearner._update_atoms(np.eye(3, dtype=np.float32), gram, cross)
+    # The best first atom lies inside, the best second outside, and nothing uses the third.
+    assert np.array_equal(atoms, np.diag([0.25, 1.0, 1.0]))
+
+
 def test_unused_atoms_are_replaced_by_what_is_represented_worst():
     # 39 volumes along one direction, one along another that the dictionary does not know.
     white = np.zeros((40, D), np.float32)
