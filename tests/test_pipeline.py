@@ -126,6 +126,11 @@ def test_a_slow_sink_fills_bounded_queues_and_loses_nothing():
         pipeline = Pipeline(endless(read), one, [sink])
         task = asyncio.create_task(pipeline.run())
         await until(lambda: pipeline.stats().queued_in == 8 and pipeline.stats().queued_out == 8)
+        # They stay so for as long as the sink waits: every hop lets the other threads run.
+        for _ in range(300):
+            await asyncio.to_thread(int)
+            assert pipeline.stats().queued_in <= 8
+            assert pipeline.stats().queued_out <= 8
         # One group more is in the hands of each task.
         n_items = pipeline.stats().items
         assert n_items <= 8 + 8 + 3

@@ -145,7 +145,8 @@ def test_auto_reads_everything_where_reading_is_free():
 @pytest.mark.parametrize("encoding", ["soft", "split", "triangle"])
 def test_finals_do_not_depend_on_the_policy_and_equal_the_offline_path(encoding):
     model = tiny.encoder(encoding=encoding)
-    items = tiny.labelled_items(4)
+    # Samples end where a bin does: a microsecond more would be another window.
+    items = tiny.labelled_items(4, duration_us=WINDOW)
     samples = [
         Sample(label, np.concatenate([a.events, b.events]), tiny.RESOLUTION)
         for label, a, b in zip(items[::3], items[1::3], items[2::3], strict=True)
