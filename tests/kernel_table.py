@@ -355,7 +355,9 @@ def make_quadrant(rng):
 
 
 def make_covering(rng):
-    return int(rng.integers(0, 30)), int(rng.integers(1, 8)), random_engine(rng).encoder.operator
+    patch, stride, count = (int(n) for n in rng.integers(1, 7, 3))
+    operator = random_engine(rng).encoder.operator._replace(patch=patch, stride=stride)
+    return int(rng.integers(0, (count - 1) * stride + patch + 2)), count, operator
 
 
 def make_encode_volume(rng):

@@ -12,7 +12,7 @@ from numba.core.registry import CPUDispatcher
 from streamfeat import kernels
 from streamfeat.kernels.lasso import duality_gap
 
-ROUNDS = 30
+ROUNDS = 50
 
 
 def all_kernels():
