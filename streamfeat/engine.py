@@ -144,7 +144,8 @@ class Engine:
         """
         update(self.grid_shape, self._operator, self._state)
         volumes = self.grid_shape[0] * self.grid_shape[1]
-        return look_ahead(volumes, columns, self.grid_shape, self._operator, self._state) > 0
+        left = look_ahead(volumes, columns, self.grid_shape, self._operator, self._state)
+        return bool(left > 0)
 
     @staticmethod
     def _checked(batch: Events) -> Events:

@@ -23,14 +23,14 @@ from streamfeat.kernels.layout import (
 )
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def deviation(moments: NDArray[np.int64], entries: int, eps: float) -> float:
     """Standard deviation of a volume's entries, `sqrt(mean of squares - square of mean + eps)`."""
     mean = moments[MOMENT_SUM] / entries
     return math.sqrt(moments[MOMENT_SQUARES] / entries - mean * mean + eps)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator) -> float:
     """`|x|^2` of a volume, from its quadratic and linear form; from 0 to the square of `operator.reach`."""
     quadratic = moments[MOMENT_QUADRATIC] * operator.quadratic_scale / (sigma * sigma)
@@ -38,7 +38,7 @@ def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator
     return min(max(quadratic - 2.0 * linear + operator.constant, 0.0), operator.reach * operator.reach)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def soft_code(
     projection: NDArray[np.int32], sigma: float, operator: Operator, code: NDArray[np.int32]
 ) -> None:
@@ -53,7 +53,7 @@ def soft_code(
         code[k] = np.int32(z - min(max(z, -threshold), threshold))
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def triangle_code(
     projection: NDArray[np.int32],
     sigma: float,
@@ -88,7 +88,7 @@ def triangle_code(
     code[n_filters:] = 0
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32]) -> None:
     """Add (`sign` 1) or take away (`sign` -1) the code of one volume from the sums of its quadrant.
 
@@ -109,7 +109,7 @@ def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32
             pooled[k] += sign * code[k]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def move_code(
     change: int,
     column: NDArray[np.int16],

@@ -16,21 +16,21 @@ ADD, TAKE = np.int64(1), np.int64(-1)
 """NumPy scalars, because a kernel is compiled once more for each Python literal it is called with."""
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def quadrant(volume: int, shape: tuple[int, int]) -> int:
     """Quadrant of a volume: 0 top left, 1 top right, 2 bottom left, 3 bottom right."""
     row, column = volume // shape[1], volume % shape[1]
     return 2 * (2 * row >= shape[0]) + (2 * column >= shape[1])
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def covering(pixel: int, count: int, operator: Operator) -> tuple[int, int]:
     """First and last plus one of the `count` volumes along one axis that cover a pixel."""
     first = max(0, (pixel - operator.patch + operator.stride) // operator.stride)
     return first, min(count, pixel // operator.stride + 1)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def encode_volume(
     projection: NDArray[np.int32],
     moments: NDArray[np.int64],
@@ -66,7 +66,7 @@ def encode_volume(
         soft_code(projection, sigma, operator, state.code)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def pool_volume(
     plane: int, row: int, volume: int, sign: int, shape: tuple[int, int], operator: Operator, state: State
 ) -> None:

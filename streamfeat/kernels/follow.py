@@ -28,7 +28,7 @@ SLICE = 96
 """Columns that one event may add for the sake of the next bin."""
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def change_volume(
     plane: int,
     volume: int,
@@ -75,7 +75,7 @@ def change_volume(
     state.tally[TALLY_ENCODED] += 1
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def change_place(place: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
@@ -113,7 +113,7 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
     applied[place] = after
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def follow(
     events: Events, height: int, width: int, shape: tuple[int, int], operator: Operator, state: State
 ) -> None:

@@ -30,7 +30,7 @@ UNCHANGED = -1
 """Instead of a place: no clipped count changed."""
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def advance_to_bin(new: int, operator: Operator, state: State) -> None:
     """Make `new` the current bin: the slots of bins that leave the window are cleared for reuse.
 
@@ -57,7 +57,7 @@ def advance_to_bin(new: int, operator: Operator, state: State) -> None:
     clock[CLOCK_PLANE] = next_plane
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def count_event(
     x: int, y: int, p: int, t: int, height: int, width: int, operator: Operator, state: State
 ) -> int:
@@ -100,7 +100,7 @@ def count_event(
     return (slot * counts.shape[1] + row) * counts.shape[2] + column
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def count_events(events: Events, height: int, width: int, operator: Operator, state: State) -> None:
     """Count every event of a batch, and note the entries that changed for the next reading.
 

@@ -19,7 +19,7 @@ CURRENT, NEXT = np.int64(0), np.int64(1)
 """Bins by which a plane is ahead."""
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def enter_volume(plane: int, ahead: int, shape: tuple[int, int], operator: Operator, state: State) -> int:
     """Let the next volume enter a plane: project it from nothing, encode it, pool it.
 
@@ -52,7 +52,7 @@ def enter_volume(plane: int, ahead: int, shape: tuple[int, int], operator: Opera
     return filled
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def complete(shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Let all volumes that are missing enter the current plane."""
     plane = state.clock[CLOCK_PLANE]
@@ -60,7 +60,7 @@ def complete(shape: tuple[int, int], operator: Operator, state: State) -> None:
         enter_volume(plane, CURRENT, shape, operator, state)
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def look_ahead(goal: int, budget: int, shape: tuple[int, int], operator: Operator, state: State) -> int:
     """Let volumes enter the plane that looks ahead, until `goal` are in it or the budget is spent.
 

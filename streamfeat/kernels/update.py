@@ -14,7 +14,7 @@ from streamfeat.kernels.planes import complete
 from streamfeat.kernels.volume import change_entry, gather_volume
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def apply_touched(shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Apply the net change of every touched entry to all planes; encode each changed volume once."""
     n_bins, height, width = state.counts.shape
@@ -74,7 +74,7 @@ def apply_touched(shape: tuple[int, int], operator: Operator, state: State) -> N
     state.clock[CLOCK_TOUCHED] = 0
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def update(shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Make the current plane that of the counts.
 

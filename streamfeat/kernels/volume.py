@@ -17,21 +17,21 @@ from streamfeat.kernels.layout import (
 )
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def add_column(change: int, column: NDArray[np.int16], projection: NDArray[np.int32]) -> None:
     """Add `change` times an int16 column to an int32 projection: `q += s P[:, i]`."""
     for k in range(projection.shape[0]):
         projection[k] += change * np.int32(column[k])
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def change_moments(before: int, after: int, moments: NDArray[np.int64]) -> None:
     """Let one entry of a volume change in the sum and in the sum of squares."""
     moments[MOMENT_SUM] += after - before
     moments[MOMENT_SQUARES] += after * after - before * before
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def change_entry(
     entry: int,
     before: int,
@@ -65,7 +65,7 @@ def change_entry(
         moments[MOMENT_LINEAR] += change * np.int64(operator.linear[entry])
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def gather_volume(
     ring: NDArray[np.int16],
     first_slot: int,
@@ -103,7 +103,7 @@ def gather_volume(
     return filled
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@njit(cache=True, nogil=True)
 def project_volume(
     values: NDArray[np.int16],
     operator: Operator,
