@@ -125,7 +125,7 @@ def move_code(
     computed again from the old projection: keeping it would move as many bytes as the projection itself.
 
     Args:
-        change: of the clipped count.
+        change: of the clipped count, 1 or -1.
         column: `(Kp,)` of the entry.
         projection: `(Kp,)` of the volume, changed.
         sigma_before: standard deviation of the volume before the change.
@@ -136,13 +136,14 @@ def move_code(
     before = np.float32(operator.scale * operator.unit / sigma_before)
     after = np.float32(operator.scale * operator.unit / sigma_after)
     threshold = np.float32(operator.threshold)
-    step, offset = np.int32(change), operator.offset
+    # In int16, where a column fits: twice as quick as to widen first.
+    step, offset = np.int16(change), operator.offset
     width = projection.shape[0]
     if operator.kind == SPLIT:
         positive, negative = pooled[:width], pooled[width:]
         for k in range(width):
             q = projection[k]
-            moved = np.int32(q + step * np.int32(column[k]))
+            moved = np.int32(q + np.int32(np.int16(step * column[k])))
             projection[k] = moved
             z = np.float32(q) * before - offset[k]
             old = np.int32(z - min(max(z, -threshold), threshold))
@@ -153,7 +154,7 @@ def move_code(
     else:
         for k in range(width):
             q = projection[k]
-            moved = np.int32(q + step * np.int32(column[k]))
+            moved = np.int32(q + np.int32(np.int16(step * column[k])))
             projection[k] = moved
             z = np.float32(q) * before - offset[k]
             old = np.int32(z - min(max(z, -threshold), threshold))
