@@ -36,7 +36,6 @@ _KIND = "streamfeat-encoder"
 Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
 
-_INT16, _INT32 = 2**15 - 1, 2**31 - 1
 _LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
 
 

@@ -47,7 +47,7 @@ def change_volume(
         entry: index into the volume.
         before: clipped count that the plane stands for; `state.values` holds the whole volume where the
             operator has a quadratic form.
-        after: clipped count that it shall stand for.
+        after: clipped count that it shall stand for, one more or one less.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: the plane and scratch are changed.
@@ -80,7 +80,7 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
     Args:
-        place: flat index of the entry.
+        place: flat index of the entry, whose clipped count went up or down by one.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: planes, `applied` and scratch are changed.
@@ -135,6 +135,7 @@ def follow(
         complete(shape, operator, state)
         if place != UNCHANGED:
             change_place(place, shape, operator, state)
-        elapsed = min(max(event.t - state.clock[CLOCK_START], 0), operator.bin_us)
+        start = state.clock[CLOCK_START]
+        elapsed = min(max(event.t, start), start + operator.bin_us) - start  # any time: no overflow
         goal = shape[0] * shape[1] * elapsed * 5 // (4 * operator.bin_us)
         look_ahead(goal, SLICE, shape, operator, state)
