@@ -63,12 +63,14 @@ class Snapshot:
     """All that an engine needs to go on as if nothing had happened.
 
     Attributes:
+        fingerprint: of the encoder.
         counts: `(T, H, W)` int32, the ring.
         atoms: `(V, K)` float32, lasso codes to start from (inverse formulation; else `(V, 0)`).
         clock: `(5,)` int64, of which the current bin and the origin matter.
         tally: `(6,)` int64, what was counted.
     """
 
+    fingerprint: str
     counts: NDArray[np.int32]
     atoms: NDArray[np.float32]
     clock: NDArray[np.int64]
@@ -86,7 +88,8 @@ class Engine:
             in `prepare`. Costs a second copy of the projections; for those who read after single events.
 
     Raises:
-        InputError: the sensor has no place for a single volume, or so many that sums could overflow.
+        InputError: the sensor has no place for a single volume, or so many that sums could overflow; or the
+            origin is beyond 2^62 microseconds.
     """
 
     def __init__(
@@ -101,7 +104,7 @@ class Engine:
             encoder.geometry,
             self._operator,
             resolution,
-            origin_us=origin_us,
+            origin_us=self._checked_time(origin_us),
             planes=2 if look_ahead else 1,
         )
 
@@ -164,10 +167,14 @@ class Engine:
         Raises:
             InputError: the time is beyond 2^62 microseconds.
         """
+        since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
+        advance_to_bin(since // self._operator.bin_us, self._operator, self._state)
+
+    @staticmethod
+    def _checked_time(t_us: int) -> int:
         if not BEFORE_TIME < t_us < -BEFORE_TIME:
             raise InputError(f"a time of {t_us} us is beyond 2^62")
-        origin = int(self._state.clock[CLOCK_ORIGIN])
-        advance_to_bin((int(t_us) - origin) // self._operator.bin_us, self._operator, self._state)
+        return int(t_us)
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
@@ -194,8 +201,12 @@ class Engine:
         return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
 
     def restart(self, origin_us: int) -> None:
-        """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted."""
-        state = self._state
+        """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted.
+
+        Raises:
+            InputError: the origin is beyond 2^62 microseconds.
+        """
+        state, origin = self._state, self._checked_time(origin_us)
         state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
         for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
             array[:] = 0
@@ -203,13 +214,14 @@ class Engine:
         state.cursors[:] = 0
         state.clock[:] = 0
         state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
-        state.clock[CLOCK_ORIGIN] = origin_us
+        state.clock[CLOCK_ORIGIN] = origin
 
     def snapshot(self) -> Snapshot:
         """Copy the state. Projections and codes are not part of it: they follow from the counts."""
         update(self.grid_shape, self._operator, self._state)
         state = self._state
         return Snapshot(
+            fingerprint=self.encoder.fingerprint,
             counts=state.counts.copy(),
             atoms=state.atoms[state.clock[CLOCK_PLANE]].copy(),
             clock=state.clock.copy(),
@@ -220,9 +232,14 @@ class Engine:
         """Go on from a snapshot of an engine with the same encoder and resolution.
 
         Raises:
-            InputError: the snapshot is of another geometry.
+            InputError: the snapshot is of another encoder or another resolution.
         """
         state, limit = self._state, self._operator.max_count
+        if snapshot.fingerprint != self.encoder.fingerprint:
+            raise InputError(
+                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
+                f"{self.encoder.fingerprint[:12]}"
+            )
         if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != state.atoms.shape[1:]:
             raise InputError(
                 f"the snapshot holds a ring of {snapshot.counts.shape} and codes of {snapshot.atoms.shape}, "
@@ -233,4 +250,6 @@ class Engine:
         state.applied[:] = snapshot.counts.clip(-limit, limit)
         state.atoms[state.clock[CLOCK_PLANE]] = snapshot.atoms
         state.clock[[CLOCK_NOW, CLOCK_START]] = snapshot.clock[[CLOCK_NOW, CLOCK_START]]
+        # Before time moves on: lasso codes are kept of volumes only that are not empty.
+        update(self.grid_shape, self._operator, state)
         state.tally[:] = snapshot.tally

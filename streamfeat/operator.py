@@ -138,6 +138,8 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
             raise InputError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}")
     if not (0 < operator.eps < math.inf and operator.scale > 0 and 0 < operator.gap < 1):
         raise InputError("eps, scale and gap must be finite and above zero, and gap below one")
+    if (operator.columns < -_INT16).any():
+        raise InputError(f"columns must lie between {-_INT16} and {_INT16}, so that all can be negated")
     if operator.columns[:, operator.n_filters :].any():
         raise InputError(f"columns holds more filters than {operator.n_filters}")
     if not (np.isfinite(operator.offset).all() and np.isfinite(operator.square_norms).all()):

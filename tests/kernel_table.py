@@ -92,9 +92,9 @@ def in_planes(state):
 def assert_pooled(shape, operator, state):
     """What is pooled are the codes that are there."""
     pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code)
-    for plane, volume in in_planes(state):
-        naive.fix_atoms(state.atoms[plane, volume], operator, fixed)
-        naive.pool(fixed, 1, operator.kind, pooled[plane, naive.quadrant(volume, shape)])
+    for plane, row in in_planes(state):
+        naive.fix_atoms(state.atoms[plane, row], operator, fixed)
+        naive.pool(fixed, 1, operator.kind, pooled[plane, naive.quadrant(row, shape)])
     np.testing.assert_array_equal(state.pooled, pooled)
 
 
@@ -475,10 +475,10 @@ def forget_from(cursor, plane, shape, operator, state):
     """Let volumes from the cursor on leave a plane; their rows stay as they are."""
     state.cursors[plane] = min(cursor, state.cursors[plane])
     state.pooled[plane] = 0
-    for volume in range(state.cursors[plane]):
-        row_of = (field[plane, volume] for field in (state.projections, state.moments, state.atoms))
+    for row in range(state.cursors[plane]):
+        row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
         naive.encode_volume(*row_of, False, operator, state)
-        naive.pool(state.code, 1, operator.kind, state.pooled[plane, naive.quadrant(volume, shape)])
+        naive.pool(state.code, 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
 
 
 def make_complete(rng):
