@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from streamfeat.kernels.layout import Operator
 
-MAX_ROUNDS = 1000
-"""Rounds, each a look at the gap and at all atoms; reached only where the gap is below float rounding."""
+MAX_ROUNDS = 20_000
+"""Rounds, each a look at the gap and at all atoms; reached only where the gap is below float rounding.
+
+Many atoms in few dimensions may take thousands, when codes change hands between nearly equal atoms.
+"""
 
 SWEEPS = 3
 """Sweeps over the active set in one round: about as dear as the look at the gap that they save."""
