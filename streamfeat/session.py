@@ -85,6 +85,7 @@ class Session:
         self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
         self._classifier = classifier
         self._clock = clock
+        self._every_event = policy == EmitPolicy("events", 1)
         self._engine: Engine | None = None
         self._sample: Label | None = None
         self._seen_label = False
@@ -159,7 +160,7 @@ class Session:
             return self._engine
         if self._engine:
             _add_engine(self._stats, self._engine)
-        self._engine = Engine(self.encoder, resolution, origin_us=self._origin)
+        self._engine = Engine(self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event)
         return self._engine
 
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
@@ -215,7 +216,10 @@ class Session:
         return self.encoder.geometry.window_us
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
-        engine.feed(events)
+        if self._every_event:
+            engine.follow(events)
+        else:
+            engine.feed(events)
         self._unread += len(events)
         self._last_us = max(self._last_us, int(latest[-1]))
 
