@@ -20,13 +20,10 @@ from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.layout import (
     ENCODINGS,
-    FIXED_POINT_ONE,
-    LANES,
-    LARGEST_SQUARE,
     SPLIT,
-    TRIANGLE,
     Operator,
 )
+from streamfeat.operator import check_operator, fixed_fields, quantise
 from streamfeat.safe_arrays import one_line, read_safetensors, write_safetensors
 from streamfeat.window import encode_window
 
@@ -39,7 +36,6 @@ _KIND = "streamfeat-encoder"
 Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
 
-_INT16, _INT32 = 2**15 - 1, 2**31 - 1
 _LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
 
 
@@ -110,9 +106,8 @@ class Encoder:
         whitening32 = np.array(whitening, np.float32, order="C")
         mean32 = np.array(mean, np.float32, order="C")
         _check_parameters(geometry, formulation, encoding, threshold, filters32, whitening32, mean32)
-        operator = _quantise(
-            geometry, formulation, encoding, threshold, filters32, whitening32, mean32, eps, gap
-        )
+        fixed = fixed_fields(geometry, formulation, encoding, threshold, filters32)
+        operator = quantise(geometry, fixed, filters32, whitening32, mean32, eps, gap)
         return cls._checked(
             geometry=geometry,
             formulation=formulation,
@@ -127,8 +122,8 @@ class Encoder:
 
     @classmethod
     def _checked(cls, **fields: Any) -> Self:
+        fields["operator"] = check_operator(fields["geometry"], fields["operator"])
         encoder = cls(**fields)
-        _check_ranges(encoder.geometry, encoder.operator)
         for array in (encoder.filters, encoder.whitening, encoder.mean, *encoder.operator):
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False
@@ -214,7 +209,7 @@ class Encoder:
         scalars = {name: float(header["scalars"][name]) for name in _STORED_SCALARS}
         if not all(math.isfinite(value) for value in scalars.values()):
             raise InputError("a scalar is not finite")
-        fields = _fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
+        fields = fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
         operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in _STORED_ARRAYS})
         provenance = header.get("provenance", {})
         if not isinstance(provenance, dict):
@@ -233,7 +228,7 @@ class Encoder:
 
 
 _STORED_ARRAYS = ("columns", "offset", "quadratic", "linear", "square_norms")
-_STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "gap")
+_STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "reach", "gap")
 
 
 def _check_parameters(
@@ -260,141 +255,3 @@ def _check_parameters(
     for name, array in (("filters", filters), ("whitening", whitening), ("mean", mean)):
         if array.dtype != np.float32 or not (np.abs(array) <= _LARGEST).all():
             raise InputError(f"{name} must be finite float32 of at most {_LARGEST:g}")
-
-
-def _fixed_fields(
-    geometry: Geometry,
-    formulation: Formulation,
-    encoding: Encoding,
-    threshold: float,
-    filters: NDArray[np.float32],
-) -> dict[str, Any]:
-    """The fields of an operator that follow exactly from the parameters."""
-    kind = ENCODINGS[encoding]
-    inverse = formulation == "inverse" and kind != TRIANGLE
-    atoms = filters.astype(np.float64)
-    return {
-        "patch": geometry.patch,
-        "stride": geometry.stride,
-        "downsample": geometry.downsample,
-        "bin_us": geometry.bin_us,
-        "max_count": geometry.max_count,
-        "n_filters": filters.shape[0],
-        "kind": kind,
-        "inverse": inverse,
-        "threshold": float(np.float32(threshold * FIXED_POINT_ONE)),
-        "gram": (atoms @ atoms.T).astype(np.float32) if inverse else np.zeros((0, 0), np.float32),
-    }
-
-
-def _quantise(
-    geometry: Geometry,
-    formulation: Formulation,
-    encoding: Encoding,
-    threshold: float,
-    filters: NDArray[np.float32],
-    whitening: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    eps: float,
-    gap: float,
-) -> Operator:
-    fixed = _fixed_fields(geometry, formulation, encoding, threshold, filters)
-    k, d = filters.shape
-    padded = -(-k // LANES) * LANES
-    white = whitening.astype(np.float64)
-    projector = filters.astype(np.float64) @ white
-    offset = projector @ mean
-    # Mean removal: P (I - 1 1'/d).
-    projector -= projector.mean(axis=1, keepdims=True)
-    scale = float(np.abs(projector).max()) / _INT16 or 1.0
-    columns = np.zeros((d, padded), np.int16)
-    columns[:, :k] = np.rint(projector.T / scale)
-    padded_offset = np.zeros(padded, np.float32)
-    padded_offset[:k] = offset * FIXED_POINT_ONE
-    square_norms = np.zeros(padded, np.float32)
-    square_norms[:k] = np.square(filters.astype(np.float64)).sum(axis=1)
-    quadratic, linear = np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
-    quadratic_scale = linear_scale = 1.0
-    if fixed["inverse"] or fixed["kind"] == TRIANGLE:
-        centred = white - white.mean(axis=1, keepdims=True)
-        form = centred.T @ centred
-        form = (form + form.T) / 2
-        row = (white @ mean) @ centred
-        # The largest scale at which neither an entry nor any sum of them can overflow.
-        sum_of_form = float(np.abs(form).sum()) * geometry.max_count**2
-        quadratic_scale = max(float(np.abs(form).max()) / _INT32, sum_of_form / 2.0**61, 1e-30)
-        linear_scale = max(float(np.abs(row).max()) / _INT32, 1e-30)
-        quadratic = np.rint(form / quadratic_scale).astype(np.int32)
-        linear = np.rint(row / linear_scale).astype(np.int32)
-    return Operator(
-        **fixed,
-        columns=columns,
-        scale=scale,
-        eps=float(eps),
-        offset=padded_offset,
-        quadratic=quadratic,
-        quadratic_scale=quadratic_scale,
-        linear=linear,
-        linear_scale=linear_scale,
-        constant=float(np.square(white @ mean).sum()),
-        square_norms=square_norms,
-        gap=float(gap),
-    )
-
-
-def _check_ranges(geometry: Geometry, operator: Operator) -> None:
-    """Refuse an operator whose arrays do not fit, or whose integers could overflow."""
-    d, padded = geometry.entries, -(-operator.n_filters // LANES) * LANES
-    form = (d, d) if operator.inverse or operator.kind == TRIANGLE else (0, 0)
-    expected: dict[str, tuple[type, tuple[int, ...]]] = {
-        "columns": (np.int16, (d, padded)),
-        "offset": (np.float32, (padded,)),
-        "square_norms": (np.float32, (padded,)),
-        "quadratic": (np.int32, form),
-        "linear": (np.int32, form[:1]),
-    }
-    for name, (dtype, shape) in expected.items():
-        array = getattr(operator, name)
-        if array.dtype != dtype or array.shape != shape:
-            raise InputError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}")
-    if not (0 < operator.eps < math.inf and operator.scale > 0 and 0 < operator.gap < 1):
-        raise InputError("eps, scale and gap must be finite and above zero, and gap below one")
-    if operator.columns[:, operator.n_filters :].any():
-        raise InputError(f"columns holds more filters than {operator.n_filters}")
-    if not (np.isfinite(operator.offset).all() and np.isfinite(operator.square_norms).all()):
-        raise InputError("offset and square_norms must be finite")
-    magnitude = np.abs(operator.columns.astype(np.int64))
-    reach = geometry.max_count * int(magnitude.sum(axis=0).max())
-    if reach > _INT32:
-        raise InputError(
-            f"geometry: a projection could reach max_count {geometry.max_count} x "
-            f"{reach // geometry.max_count} (the largest sum of a quantised filter) = {reach}, "
-            "which is not below 2^31; lower max_count"
-        )
-    norms = np.sqrt(np.square(operator.columns.astype(np.float64)).sum(axis=0)) * operator.scale
-    # Rounding leaves a trace of the mean in each filter; it weighs most in a volume that is nearly constant.
-    leak = np.abs(operator.columns.sum(axis=0, dtype=np.int64)) * operator.scale
-    code = float(
-        norms.max() * math.sqrt(d)
-        + leak.max() * geometry.max_count / math.sqrt(operator.eps)
-        + np.abs(operator.offset).max() / FIXED_POINT_ONE
-    )
-    limit = 2**31 // FIXED_POINT_ONE
-    if not code < limit:
-        raise InputError(
-            f"filters: a code could reach |filter| {norms.max():.4g} x sqrt({d}) + offset = {code:.4g}, "
-            f"which is not below {limit}, the range of the fixed point; scale the filters or raise eps_zca"
-        )
-    if not operator.square_norms.max() < LARGEST_SQUARE:
-        raise InputError(f"filters: a squared length is not below {LARGEST_SQUARE}; scale the filters")
-    if form[0]:
-        _check_form(geometry, operator)
-
-
-def _check_form(geometry: Geometry, operator: Operator) -> None:
-    """Refuse a quadratic or linear form that could overflow."""
-    total = np.abs(operator.quadratic.astype(np.float64)).sum() * geometry.max_count**2
-    if total >= 2.0**62 or not np.array_equal(operator.quadratic, operator.quadratic.T):
-        raise InputError(f"quadratic must be symmetric and sum to less than 2^62, it sums to {total:.4g}")
-    if not (operator.quadratic_scale > 0 and operator.linear_scale > 0 and operator.constant >= 0):
-        raise InputError("the scales and the constant of the quadratic form must not be negative")

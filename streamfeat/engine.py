@@ -16,15 +16,20 @@ from numpy.typing import NDArray
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.kernels.encode import encode_volume
+from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
-    FIXED_POINT_ONE,
+    CLOCK_PLANE,
+    CLOCK_START,
     MOMENT_SQUARES,
 )
-from streamfeat.kernels.update import encode_volume, update
+from streamfeat.kernels.planes import look_ahead
+from streamfeat.kernels.update import update
+from streamfeat.operator import with_fixed_point
 from streamfeat.state import allocate_state, read_features
 
 __all__ = ["Engine", "EngineStats", "Snapshot"]
@@ -58,12 +63,14 @@ class Snapshot:
     """All that an engine needs to go on as if nothing had happened.
 
     Attributes:
+        fingerprint: of the encoder.
         counts: `(T, H, W)` int32, the ring.
         atoms: `(V, K)` float32, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        clock: `(2,)` int64, current bin and origin in microseconds.
+        clock: `(5,)` int64, of which the current bin and the origin matter.
         tally: `(6,)` int64, what was counted.
     """
 
+    fingerprint: str
     counts: NDArray[np.int32]
     atoms: NDArray[np.float32]
     clock: NDArray[np.int64]
@@ -77,18 +84,29 @@ class Engine:
         encoder: the frozen encoder.
         resolution: `(height, width)` of the sensor.
         origin_us: stream time at which bin 0 starts.
+        look_ahead: prepare each bin boundary beforehand, in slices: with every event that is followed, and
+            in `prepare`. Costs a second copy of the projections; for those who read after single events.
 
     Raises:
-        InputError: the sensor has no place for a single volume.
+        InputError: the sensor has no place for a single volume, or so many that sums could overflow; or the
+            origin is beyond 2^62 microseconds.
     """
 
-    def __init__(self, encoder: Encoder, resolution: Resolution, *, origin_us: int = 0) -> None:
+    def __init__(
+        self, encoder: Encoder, resolution: Resolution, *, origin_us: int = 0, look_ahead: bool = False
+    ) -> None:
         """Allocate everything; nothing is allocated later but the copies that are handed out."""
         self.encoder = encoder
         self.resolution = resolution
         self.grid_shape = encoder.geometry.grid_shape(resolution)
-        self._state = allocate_state(encoder.geometry, encoder.operator, resolution, origin_us=origin_us)
-        self._encoded = 0
+        self._operator = with_fixed_point(encoder.operator, self.grid_shape)
+        self._state = allocate_state(
+            encoder.geometry,
+            self._operator,
+            resolution,
+            origin_us=self._checked_time(origin_us),
+            planes=2 if look_ahead else 1,
+        )
 
     def feed(self, batch: Events) -> None:
         """Count the events of a batch. Exact, whatever the order, and cheap.
@@ -100,12 +118,45 @@ class Engine:
         Raises:
             InputError: not an array of EVENT_DTYPE.
         """
+        events = self._checked(batch)
+        count_events(events, *self.resolution, self._operator, self._state)
+
+    def follow(self, batch: Events) -> None:
+        """Feed a batch event by event, with features brought up to date after each.
+
+        Leaves the engine as `feed` and a reading would. Costs more for many events, and less for one.
+
+        Args:
+            batch: as for `feed`.
+
+        Raises:
+            InputError: not an array of EVENT_DTYPE.
+        """
+        events = self._checked(batch)
+        update(self.grid_shape, self._operator, self._state)
+        follow(events, *self.resolution, self.grid_shape, self._operator, self._state)
+
+    def prepare(self, columns: int) -> bool:
+        """Use idle time to look ahead to the next bin boundary.
+
+        Args:
+            columns: operator columns that may be added, a bound of the work.
+
+        Returns:
+            whether nothing is left to prepare.
+        """
+        update(self.grid_shape, self._operator, self._state)
+        volumes = self.grid_shape[0] * self.grid_shape[1]
+        left = look_ahead(volumes, columns, self.grid_shape, self._operator, self._state)
+        return bool(left > 0)
+
+    @staticmethod
+    def _checked(batch: Events) -> Events:
         if not isinstance(batch, np.ndarray) or batch.dtype != EVENT_DTYPE or batch.ndim != 1:
             raise InputError(f"a batch must be a one-dimensional array of {EVENT_DTYPE}")
         if not (batch.flags.writeable and batch.flags.c_contiguous):
-            batch = batch.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
-        height, width = self.resolution
-        count_events(batch, height, width, self.encoder.operator, self._state)
+            return batch.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
+        return batch
 
     def advance(self, t_us: int) -> None:
         """Let stream time pass without events. Going back in time does nothing.
@@ -116,78 +167,89 @@ class Engine:
         Raises:
             InputError: the time is beyond 2^62 microseconds.
         """
+        since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
+        advance_to_bin(since // self._operator.bin_us, self._operator, self._state)
+
+    @staticmethod
+    def _checked_time(t_us: int) -> int:
         if not BEFORE_TIME < t_us < -BEFORE_TIME:
             raise InputError(f"a time of {t_us} us is beyond 2^62")
-        origin = int(self._state.clock[CLOCK_ORIGIN])
-        advance_to_bin((int(t_us) - origin) // self.encoder.geometry.bin_us, self._state)
+        return int(t_us)
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        self._update()
-        return read_features(self.encoder.operator, self._state)
+        update(self.grid_shape, self._operator, self._state)
+        return read_features(self._operator, self._state)
 
     def codes(self) -> NDArray[np.float32]:
         """The code of every local volume, a copy: `(rows, columns, K)` float32, before any split."""
-        self._update()
-        state, operator = self._state, self.encoder.operator
-        rows, columns = self.grid_shape
-        codes = np.empty((rows * columns, operator.n_filters), np.float32)
-        for volume in range(rows * columns):
-            encode_volume(
-                state.projections[volume],
-                state.moments[volume],
-                state.atoms[volume],
-                False,
-                operator,
-                state,
-            )
-            codes[volume] = state.code[: operator.n_filters] / FIXED_POINT_ONE
-        return codes.reshape(rows, columns, operator.n_filters)
+        update(self.grid_shape, self._operator, self._state)
+        state, operator = self._state, self._operator
+        plane = state.clock[CLOCK_PLANE]
+        rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
+        codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
+        for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
+            encode_volume(projection, moments, atoms, False, operator, state)
+            code[:] = state.code[: operator.n_filters] / operator.unit
+        return codes.reshape(*self.grid_shape, operator.n_filters)
 
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
-        events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)
-        active = int(np.count_nonzero(self._state.moments[:, MOMENT_SQUARES]))
-        return EngineStats(events, late, rejected, saturated, rolls, active, self._encoded)
+        events, late, rejected, saturated, rolls, encoded = (int(value) for value in self._state.tally)
+        plane = self._state.clock[CLOCK_PLANE]
+        active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
+        return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
 
     def restart(self, origin_us: int) -> None:
-        """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted."""
-        state = self._state
-        for array in (state.counts, state.applied, state.is_touched, state.projections, state.moments):
+        """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted.
+
+        Raises:
+            InputError: the origin is beyond 2^62 microseconds.
+        """
+        state, origin = self._state, self._checked_time(origin_us)
+        state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
+        for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
             array[:] = 0
-        state.atoms[:] = 0
         state.pooled[:] = 0
-        state.clock[:] = (BEFORE_TIME, BEFORE_TIME, 0, origin_us)
+        state.cursors[:] = 0
+        state.clock[:] = 0
+        state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+        state.clock[CLOCK_ORIGIN] = origin
 
     def snapshot(self) -> Snapshot:
         """Copy the state. Projections and codes are not part of it: they follow from the counts."""
+        update(self.grid_shape, self._operator, self._state)
         state = self._state
         return Snapshot(
+            fingerprint=self.encoder.fingerprint,
             counts=state.counts.copy(),
-            atoms=state.atoms.copy(),
-            clock=state.clock[[CLOCK_NOW, CLOCK_ORIGIN]],
-            tally=np.append(state.tally, self._encoded),
+            atoms=state.atoms[state.clock[CLOCK_PLANE]].copy(),
+            clock=state.clock.copy(),
+            tally=state.tally.copy(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of an engine with the same encoder and resolution.
 
         Raises:
-            InputError: the snapshot is of another geometry.
+            InputError: the snapshot is of another encoder or another resolution.
         """
-        state = self._state
-        if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != state.atoms.shape:
+        state, limit = self._state, self._operator.max_count
+        if snapshot.fingerprint != self.encoder.fingerprint:
+            raise InputError(
+                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
+                f"{self.encoder.fingerprint[:12]}"
+            )
+        if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != state.atoms.shape[1:]:
             raise InputError(
                 f"the snapshot holds a ring of {snapshot.counts.shape} and codes of {snapshot.atoms.shape}, "
-                f"this engine has {state.counts.shape} and {state.atoms.shape}"
+                f"this engine has {state.counts.shape} and {state.atoms.shape[1:]}"
             )
-        self.restart(int(snapshot.clock[1]))
+        self.restart(int(snapshot.clock[CLOCK_ORIGIN]))
         state.counts[:] = snapshot.counts
-        state.atoms[:] = snapshot.atoms
-        state.clock[CLOCK_NOW] = snapshot.clock[0]
-        state.tally[:] = snapshot.tally[:-1]
-        self._encoded = int(snapshot.tally[-1])
-
-    def _update(self) -> None:
-        if self._state.clock[CLOCK_NOW] > BEFORE_TIME:
-            self._encoded += update(self.grid_shape, self.encoder.operator, self._state)
+        state.applied[:] = snapshot.counts.clip(-limit, limit)
+        state.atoms[state.clock[CLOCK_PLANE]] = snapshot.atoms
+        state.clock[[CLOCK_NOW, CLOCK_START]] = snapshot.clock[[CLOCK_NOW, CLOCK_START]]
+        # Before time moves on: lasso codes are kept of volumes only that are not empty.
+        update(self.grid_shape, self._operator, state)
+        state.tally[:] = snapshot.tally

@@ -32,7 +32,7 @@ class SessionStats:
 
     Attributes:
         events: accepted.
-        late: older than the window.
+        late: older than the window, or than the labelled sample that was open.
         rejected: outside the sensor, or malformed.
         saturated: accepted without changing a clipped count.
         emissions: readings made.
@@ -85,6 +85,7 @@ class Session:
         self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
         self._classifier = classifier
         self._clock = clock
+        self._every_event = policy == EmitPolicy("events", 1)
         self._engine: Engine | None = None
         self._sample: Label | None = None
         self._seen_label = False
@@ -123,11 +124,17 @@ class Session:
         if len(events) == 0:
             return
         engine = self._engine_for(item.resolution)
-        latest = self._stream_times(events, item.resolution)
+        sound = _sound(events, item.resolution)
+        latest = self._stream_times(events, sound)
         end = len(events)
         if self._sample:
             stop = self._sample.start_us + self._sample.duration_us
             end = int(np.searchsorted(latest, stop))
+            early = sound[:end] & (events["t"][:end] < self._sample.start_us)
+            if early.any():
+                self._stats.late += int(np.count_nonzero(early))
+                kept = np.concatenate([~early, np.ones(len(events) - end, np.bool_)])
+                events, latest, end = events[kept], latest[kept], int(np.count_nonzero(kept[:end]))
         yield from self._feed(engine, events[:end], latest[:end])
         if end < len(events):
             yield from self._finish_sample()
@@ -141,11 +148,9 @@ class Session:
         if self.learner:
             self.learner.flush()
 
-    def _stream_times(self, events: Events, resolution: Resolution) -> NDArray[np.int64]:
+    def _stream_times(self, events: Events, sound: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Stream time after each event: it never goes back, and events that will be rejected have no say."""
-        height, width = resolution
         t = events["t"]
-        sound = (events["x"] < width) & (events["y"] < height) & (events["p"] >> 1 == 0) & (t < -BEFORE_TIME)
         if not sound.all():
             t = np.where(sound, t, BEFORE_TIME)
         return np.maximum(np.maximum.accumulate(t), self._last_us)
@@ -155,7 +160,7 @@ class Session:
             return self._engine
         if self._engine:
             _add_engine(self._stats, self._engine)
-        self._engine = Engine(self.encoder, resolution, origin_us=self._origin)
+        self._engine = Engine(self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event)
         return self._engine
 
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
@@ -211,7 +216,10 @@ class Session:
         return self.encoder.geometry.window_us
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
-        engine.feed(events)
+        if self._every_event:
+            engine.follow(events)
+        else:
+            engine.feed(events)
         self._unread += len(events)
         self._last_us = max(self._last_us, int(latest[-1]))
 
@@ -249,6 +257,14 @@ class Session:
         self._sample = None
         self._next_us = None
         yield emission
+
+
+def _sound(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
+    """Which events will not be rejected."""
+    height, width = resolution
+    x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
+    sound: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
+    return sound & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:

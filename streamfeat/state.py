@@ -9,13 +9,28 @@ from numpy.typing import NDArray
 
 from streamfeat.events import Resolution
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import BEFORE_TIME, FIXED_POINT_ONE, SPLIT, Operator, State
+from streamfeat.kernels.layout import (
+    BEFORE_TIME,
+    CLOCK_NOW,
+    CLOCK_ORIGIN,
+    CLOCK_PLANE,
+    CLOCK_START,
+    SPLIT,
+    Operator,
+    State,
+)
 
 __all__ = ["allocate_state", "read_features"]
 
 
 def allocate_state(
-    geometry: Geometry, operator: Operator, resolution: Resolution, *, origin_us: int = 0, keep: bool = True
+    geometry: Geometry,
+    operator: Operator,
+    resolution: Resolution,
+    *,
+    origin_us: int = 0,
+    planes: int = 1,
+    keep: bool = True,
 ) -> State:
     """An empty state for one sensor.
 
@@ -24,6 +39,7 @@ def allocate_state(
         operator: gives the number of filters and the encoding.
         resolution: `(height, width)` of the sensor.
         origin_us: start of bin 0.
+        planes: 1, or 2 to look ahead.
         keep: keep a projection for each volume; without, the state serves whole windows only.
 
     Raises:
@@ -34,22 +50,24 @@ def allocate_state(
     volumes = rows * columns if keep else 1
     padded = operator.offset.shape[0]
     atoms = operator.n_filters if operator.inverse else 0
-    clock = np.zeros(4, np.int64)
-    clock[:2] = BEFORE_TIME
-    clock[3] = origin_us
+    clock = np.zeros(5, np.int64)
+    clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+    clock[CLOCK_ORIGIN] = origin_us
+    features = 2 * padded if operator.kind == SPLIT else padded
     return State(
         counts=np.zeros(ring, np.int32),
         applied=np.zeros(ring, np.int16),
         touched=np.zeros(int(np.prod(ring)), np.int32),
         is_touched=np.zeros(ring, np.uint8),
         clock=clock,
-        tally=np.zeros(5, np.int64),
-        projections=np.zeros((volumes, padded), np.int32),
-        moments=np.zeros((volumes, 4), np.int64),
-        atoms=np.zeros((volumes, atoms), np.float32),
-        dirty=np.zeros(volumes, np.int32),
-        is_dirty=np.zeros(volumes, np.uint8),
-        pooled=np.zeros((4, 2 * padded if operator.kind == SPLIT else padded), np.int64),
+        cursors=np.zeros(planes, np.int64),
+        tally=np.zeros(6, np.int64),
+        projections=np.zeros((planes, volumes, padded), np.int32),
+        moments=np.zeros((planes, volumes, 4), np.int64),
+        atoms=np.zeros((planes, volumes, atoms), np.float32),
+        pooled=np.zeros((planes, 4, features), np.int32),
+        dirty=np.zeros(planes * volumes, np.int32),
+        is_dirty=np.zeros(planes * volumes, np.uint8),
         code=np.zeros(padded, np.int32),
         work=np.zeros((4, padded), np.float64),
         active=np.zeros(padded, np.int64),
@@ -59,5 +77,6 @@ def allocate_state(
 
 def read_features(operator: Operator, state: State) -> NDArray[np.float32]:
     """The pooled sums quadrant by quadrant, without padding: `(4 K,)` float32, or `(8 K,)` for `split`."""
-    parts = state.pooled.reshape(4, -1, operator.offset.shape[0])[:, :, : operator.n_filters]
-    return (parts.reshape(-1) / FIXED_POINT_ONE).astype(np.float32)
+    pooled = state.pooled[state.clock[CLOCK_PLANE]]
+    parts = pooled.reshape(4, -1, operator.offset.shape[0])[:, :, : operator.n_filters]
+    return np.asarray(parts.reshape(-1) / operator.unit, np.float32)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import BEFORE_TIME, Operator
-from streamfeat.kernels.update import encode_ring
+from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, Operator
+from streamfeat.kernels.planes import complete
+from streamfeat.operator import with_fixed_point
 from streamfeat.state import allocate_state, read_features
 
 __all__ = ["count_window", "encode_window"]
@@ -64,7 +65,10 @@ def encode_window(
     t_us: int | None = None,
 ) -> NDArray[np.float32]:
     """Features of one window; see `Encoder.encode`."""
-    state = allocate_state(geometry, operator, resolution, keep=False)
-    ring = count_window(geometry, events, resolution, origin_us, t_us)
-    encode_ring(ring, 0, geometry.grid_shape(resolution), operator, state)
-    return read_features(operator, state)
+    shape = geometry.grid_shape(resolution)
+    pooling = with_fixed_point(operator, shape)
+    state = allocate_state(geometry, pooling, resolution, keep=False)
+    state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
+    state.clock[CLOCK_NOW] = -1  # the window ends with the last slot
+    complete(shape, pooling, state)
+    return read_features(pooling, state)

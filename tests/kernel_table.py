@@ -14,8 +14,16 @@ from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random
 from streamfeat.engine import Engine
 from streamfeat.events import EVENT_DTYPE
 from streamfeat.geometry import Geometry
-from streamfeat.kernels import code, decode, ingest, lasso, update, volume
-from streamfeat.kernels.layout import CLOCK_NOW, FIXED_POINT_ONE, Operator, State
+from streamfeat.kernels import code, decode, encode, follow, ingest, lasso, planes, update, volume
+from streamfeat.kernels.layout import (
+    CLOCK_NOW,
+    CLOCK_ORIGIN,
+    CLOCK_PLANE,
+    MOMENT_SQUARES,
+    SPLIT,
+    Operator,
+    State,
+)
 
 SCRATCH = {"touched", "dirty", "code", "work", "active", "values"}
 """Fields of a State whose content means nothing between two calls."""
@@ -70,28 +78,39 @@ def exact_but_atoms(kernel: Run, twin: Run) -> None:
     assert_same(kernel.result, twin.result)
     assert_same(state, twin.after[-1], scratch=SCRATCH | {"atoms", "pooled"})
     assert_certified(operator, state)
-    shape = kernel.before[-3]
-    if len(state.atoms) > 1:
-        pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code)
-        for v, atoms in enumerate(state.atoms):
-            naive.fix_atoms(atoms, fixed)
-            naive.pool(fixed, 1, operator.kind, pooled[naive.quadrant(v, *shape)])
-        np.testing.assert_array_equal(state.pooled, pooled)
+    if state.projections.shape[1] > 1:
+        assert_pooled(kernel.before[-3], operator, state)
     return None
+
+
+def in_planes(state):
+    """`(plane, row)` of each volume that has entered a plane."""
+    rows = state.projections.shape[1]
+    return [(plane, row) for plane, cursor in enumerate(state.cursors) for row in range(min(cursor, rows))]
+
+
+def assert_pooled(shape, operator, state):
+    """What is pooled are the codes that are there."""
+    pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code)
+    for plane, row in in_planes(state):
+        naive.fix_atoms(state.atoms[plane, row], operator, fixed)
+        naive.pool(fixed, 1, operator.kind, pooled[plane, naive.quadrant(row, shape)])
+    np.testing.assert_array_equal(state.pooled, pooled)
 
 
 def assert_certified(operator, state):
     """Each volume's atoms solve its lasso within the relative duality gap of the operator."""
-    for projection, moments, atoms in zip(state.projections, state.moments, state.atoms, strict=True):
-        if not moments[1]:
+    for place in in_planes(state):
+        projection, moments, atoms = state.projections[place], state.moments[place], state.atoms[place]
+        if not moments[MOMENT_SQUARES]:
             assert not atoms.any()
             continue
         sigma = naive.deviation(moments, len(operator.columns), operator.eps)
         square = naive.whitened_square(moments, sigma, operator)
         k = len(atoms)
-        right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+        right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / operator.unit
         residual = right - operator.gram.astype(np.float64) @ atoms
-        penalty = operator.threshold / FIXED_POINT_ONE
+        penalty = operator.threshold / operator.unit
         gap = naive.duality_gap(residual, right, atoms.astype(np.float64), square, penalty)
         assert gap <= operator.gap * square / 2 + float32_slack(operator, atoms, square)
 
@@ -104,7 +123,7 @@ def float32_slack(operator, atoms, square):
     factor that makes the residual feasible by less than `e / lambda`, and with it the dual objective by less
     than `(e / lambda) 2 |x|^2`.
     """
-    unit, penalty = 2.0**-24, operator.threshold / FIXED_POINT_ONE
+    unit, penalty = 2.0**-24, operator.threshold / operator.unit
     error = unit * (np.abs(operator.gram.astype(np.float64)) @ np.abs(atoms)).max()
     return 2 * (penalty + error) * unit * np.abs(atoms).sum() + 2 * square * error / penalty
 
@@ -141,21 +160,14 @@ def rows_within_gap(kernel: Run, twin: Run) -> None:
 
 
 def descended(kernel: Run, twin: Run) -> None:
-    active, penalty, gram, tolerance, atoms, residual = kernel.before
-    part = gram[np.ix_(active, active)].astype(float)
-    right = residual[active] + part @ atoms[active]
-    reached = [naive.lasso_objective(right, 0, penalty, part, r.after[4][active]) for r in (kernel, twin)]
-    assert reached[0] - reached[1] <= tolerance + 1e-9
-    mine, my_residual = kernel.after[4], kernel.after[5]
-    np.testing.assert_allclose(my_residual[active], right - part @ mine[active], atol=1e-9)
-    rest = np.setdiff1d(np.arange(len(atoms)), active)
-    np.testing.assert_array_equal(mine[rest], atoms[rest])
+    for mine, yours in zip(kernel.after[3:], twin.after[3:], strict=True):
+        np.testing.assert_allclose(mine, yours, atol=1e-9)
 
 
 def lasso_code_within_gap(kernel: Run, twin: Run) -> None:
     projection, sigma, square, operator, *_ = kernel.before
-    k, penalty = operator.n_filters, operator.threshold / FIXED_POINT_ONE
-    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+    k, penalty = operator.n_filters, operator.threshold / operator.unit
+    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / operator.unit
     mine, yours = (
         naive.lasso_objective(right, square, penalty, operator.gram, run.after[4].astype(float))
         for run in (kernel, twin)
@@ -189,25 +201,42 @@ def random_engine(rng, kinds=KINDS):
     threshold = float(pick(rng, [0.02, 0.3]))
     n_filters = int(pick(rng, [1, 5, 32, 33]))
     encoder = random_encoder(rng, geometry, n_filters, formulation, encoding, threshold=threshold)
-    engine = Engine(encoder, resolution, origin_us=int(rng.integers(-2000, 2000)))
+    ahead = bool(rng.random() < 0.7)
+    engine = Engine(encoder, resolution, origin_us=int(rng.integers(-2000, 2000)), look_ahead=ahead)
     engine.feed(random_events(rng, geometry, resolution, int(rng.integers(0, 200))))
+    # Boundaries crossed one by one: rows of a plane are left from before, or were prepared.
+    for _ in range(rng.integers(0, 4)):
+        if rng.random() < 0.7:
+            engine.features()
+            engine.prepare(int(pick(rng, [1, 30, 10**6])))
+        engine.advance(bin_start(engine, 1))
     return engine
 
 
+def bin_start(engine, ahead=0):
+    """When the current bin of an engine began, or one after it begins; bin 0 if it has seen nothing."""
+    clock = engine._state.clock
+    now = max(int(clock[CLOCK_NOW]), -(2**40))
+    return int(clock[CLOCK_ORIGIN]) + (now + ahead) * engine.encoder.geometry.bin_us
+
+
 def read_engine(rng, kinds=KINDS, *, more=0):
-    """A random engine whose sums are current, with `more` events counted since, none in a new bin."""
+    """A random engine whose sums are current, the next bin partly prepared.
+
+    With `more` events counted since, none of them in a new bin.
+    """
     engine = random_engine(rng, kinds)
     engine.advance(0)
     engine.features()
+    engine.prepare(int(pick(rng, [-1, 1, 30, 300, 10**6])))
     events = random_events(rng, engine.encoder.geometry, engine.resolution, more)
-    now_us = (int(engine._state.clock[CLOCK_NOW]) + 1) * engine.encoder.geometry.bin_us - 1
-    events["t"] = np.minimum(events["t"], now_us + int(engine._state.clock[3]))
+    events["t"] = np.minimum(events["t"], bin_start(engine, 1) - 1)
     engine.feed(events)
     return engine
 
 
 def parts_of(engine):
-    return engine.grid_shape, engine.encoder.operator, copied(engine._state)
+    return engine.grid_shape, engine._operator, copied(engine._state)
 
 
 def random_values(rng, operator):
@@ -219,7 +248,7 @@ def random_values(rng, operator):
 
 def random_volume(rng, kinds=KINDS):
     """An operator and the projection and moments of one random volume that is not empty."""
-    operator = random_engine(rng, kinds).encoder.operator
+    operator = random_engine(rng, kinds)._operator
     values = random_values(rng, operator)
     values[0] = values[0] or 1
     projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
@@ -256,8 +285,33 @@ def make_triangle_code(rng):
 
 def make_pool(rng):
     kind, width = int(rng.integers(0, 3)), int(pick(rng, [32, 64]))
-    pooled = rng.integers(-(2**40), 2**40, 2 * width if kind == 1 else width)
+    pooled = rng.integers(-(2**30), 2**30, 2 * width if kind == SPLIT else width).astype(np.int32)
     return random_code(rng, width), int(pick(rng, [-1, 1])), kind, pooled
+
+
+def one_step(rng, before, operator):
+    """A clipped count after one event that changes it; often one nearer to zero."""
+    limit = operator.max_count
+    if before and rng.random() < 0.5:
+        return before - int(np.sign(before))
+    return int(pick(rng, [count for count in (before - 1, before + 1) if -limit <= count <= limit]))
+
+
+def make_move_code(rng):
+    kind = pick(rng, [("direct", "soft"), ("direct", "split")])
+    operator, projection, moments = random_volume(rng, [kind])
+    values = random_values(rng, operator)
+    values[0] = values[0] or 1
+    naive.project_volume(values, operator, projection, moments)
+    entry, d = int(rng.integers(0, len(values))), len(values)
+    before = int(values[entry])
+    after = one_step(rng, before, operator)
+    sigma = naive.deviation(moments, d, operator.eps)
+    naive.change_moments(before, after, moments)
+    width = len(projection) * (2 if operator.kind == SPLIT else 1)
+    pooled = rng.integers(-(2**30), 2**30, width).astype(np.int32)
+    sigmas = sigma, naive.deviation(moments, d, operator.eps)
+    return after - before, operator.columns[entry], projection, *sigmas, operator, pooled
 
 
 def make_evt3(rng):
@@ -276,19 +330,32 @@ def random_words(rng, kinds):
 
 
 def make_advance_to_bin(rng):
-    _, _, state = parts_of(random_engine(rng))
-    return max(int(state.clock[CLOCK_NOW]), -5000) + int(rng.integers(-2, 8)), state
+    _, operator, state = parts_of(read_engine(rng) if rng.random() < 0.7 else random_engine(rng))
+    new = max(int(state.clock[CLOCK_NOW]), -5000) + int(pick(rng, [1, 1, 1, -2, -1, 0, 2, 3, 7]))
+    return new, operator, state
+
+
+def hostile_events(rng, engine, n, n_windows=6.0):
+    events = random_events(rng, engine.encoder.geometry, engine.resolution, n, n_windows=n_windows)
+    hostile = rng.random(n) < 0.05
+    events["t"][hostile] = rng.choice([-(2**63), 2**63 - 1, 2**62, -(2**62)], hostile.sum())
+    events["p"][rng.random(n) < 0.05] = rng.choice([-1, 2, 32767, -32768])
+    events["x"][rng.random(n) < 0.05] = 65535
+    return events
+
+
+def make_count_event(rng):
+    engine = read_engine(rng)
+    (event,) = hostile_events(rng, engine, 1)
+    values = int(event["x"]), int(event["y"]), int(event["p"]), int(event["t"])
+    _, operator, state = parts_of(engine)
+    return *values, *engine.resolution, operator, state
 
 
 def make_count_events(rng):
     engine = random_engine(rng)
-    events = random_events(rng, engine.encoder.geometry, engine.resolution, 100, n_windows=6)
-    hostile = rng.random(100) < 0.05
-    events["t"][hostile] = rng.choice([-(2**63), 2**63 - 1, 2**62, -(2**62)], hostile.sum())
-    events["p"][rng.random(100) < 0.05] = rng.choice([-1, 2, 32767, -32768])
-    events["x"][rng.random(100) < 0.05] = 65535
     _, operator, state = parts_of(engine)
-    return events, *engine.resolution, operator, state
+    return hostile_events(rng, engine, 100), *engine.resolution, operator, state
 
 
 def lasso_problem(rng):
@@ -322,7 +389,12 @@ def make_descend(rng):
     right, _, gram, start = lasso_problem(rng)
     atoms = start.astype(np.float64)
     active = np.flatnonzero(rng.random(len(right)) < 0.6)
-    return active, 0.1, frozen(gram), 1e-8, atoms, right - gram.astype(np.float64) @ atoms
+    return active, 0.1, frozen(gram), atoms, right - gram.astype(np.float64) @ atoms
+
+
+def make_subtract_row(rng):
+    row, residual = rng.normal(size=33).astype(np.float32), rng.normal(size=33)
+    return float(rng.normal()), frozen(row), residual
 
 
 def make_lasso_code(rng):
@@ -335,8 +407,10 @@ def make_lasso_code(rng):
 
 
 def make_fix_atoms(rng):
-    k, scale = int(rng.integers(1, 33)), pick(rng, [1, 1e9])
-    return (scale * rng.normal(size=k)).astype(np.float32), random_code(rng, 32)
+    operator = random_engine(rng, LASSO_KINDS)._operator
+    k, scale = operator.n_filters, pick(rng, [1, 1e9])
+    atoms = (scale * rng.normal(size=k)).astype(np.float32)
+    return atoms, operator, random_code(rng, len(operator.offset))
 
 
 def make_solve_lasso_rows(rng):
@@ -351,7 +425,7 @@ def make_solve_lasso_rows(rng):
 
 def make_quadrant(rng):
     rows, columns = (int(side) for side in rng.integers(1, 9, 2))
-    return int(rng.integers(0, rows * columns)), rows, columns
+    return int(rng.integers(0, rows * columns)), (rows, columns)
 
 
 def make_covering(rng):
@@ -360,16 +434,69 @@ def make_covering(rng):
     return int(rng.integers(0, (count - 1) * stride + patch + 2)), count, operator
 
 
+def random_row(rng, state):
+    """`(plane, volume)` of a volume that has entered its plane."""
+    return pick(rng, in_planes(state))
+
+
 def make_encode_volume(rng):
     _, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
-    v = int(rng.integers(0, len(state.projections)))
-    rows = (field[v].copy() for field in (state.projections, state.moments, state.atoms))
+    place = random_row(rng, state)
+    rows = (field[place].copy() for field in (state.projections, state.moments, state.atoms))
     return *rows, bool(rng.random() < 0.5), operator, state
 
 
 def make_pool_volume(rng):
     shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
-    return int(rng.integers(0, shape[0] * shape[1])), int(pick(rng, [-1, 1])), shape, operator, state
+    plane, volume = random_row(rng, state)
+    return plane, volume, volume, np.int64(pick(rng, [-1, 1])), shape, operator, state
+
+
+def one_row(state):
+    """The state of an offline window: volumes share a row."""
+    rows = {name: getattr(state, name)[:1, :1].copy() for name in ("projections", "moments", "atoms")}
+    clock = state.clock.copy()
+    clock[CLOCK_PLANE] = 0
+    return state._replace(
+        **rows, cursors=np.zeros(1, np.int64), pooled=np.zeros_like(state.pooled[:1]), clock=clock
+    )
+
+
+def make_enter_volume(rng):
+    shape, operator, state = parts_of(read_engine(rng))
+    if rng.random() < 0.2:
+        return np.int64(0), np.int64(0), shape, operator, one_row(state)
+    plane = int(rng.integers(0, len(state.cursors)))
+    # As if it were the next to enter: the pooled sums of its plane need not hold it.
+    forget_from(int(rng.integers(0, shape[0] * shape[1])), plane, shape, operator, state)
+    ahead = plane != state.clock[CLOCK_PLANE]
+    return np.int64(plane), np.int64(ahead), shape, operator, state
+
+
+def forget_from(cursor, plane, shape, operator, state):
+    """Let volumes from the cursor on leave a plane; their rows stay as they are."""
+    state.cursors[plane] = min(cursor, state.cursors[plane])
+    state.pooled[plane] = 0
+    for row in range(state.cursors[plane]):
+        row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
+        naive.encode_volume(*row_of, False, operator, state)
+        naive.pool(state.code, 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
+
+
+def make_complete(rng):
+    shape, operator, state = parts_of(read_engine(rng))
+    if rng.random() < 0.3:
+        return shape, operator, one_row(state)
+    forget_from(
+        int(rng.integers(0, shape[0] * shape[1])), int(state.clock[CLOCK_PLANE]), shape, operator, state
+    )
+    return shape, operator, state
+
+
+def make_look_ahead(rng):
+    shape, operator, state = parts_of(random_engine(rng) if rng.random() < 0.2 else read_engine(rng))
+    goal, budget = int(rng.integers(0, 1 + shape[0] * shape[1])), int(pick(rng, [-1, 0, 1, 30, 10**6]))
+    return goal, budget, shape, operator, state
 
 
 def make_update(rng):
@@ -377,27 +504,53 @@ def make_update(rng):
     return parts_of(engine)
 
 
-def make_rebuild(rng):
-    return parts_of(random_engine(rng))
-
-
 def make_apply_touched(rng):
     return parts_of(read_engine(rng, more=40))
 
 
-def make_encode_ring(rng):
+def changed_place(rng, operator, state):
+    """Flat index of an entry whose clipped count is made another one."""
+    place = int(rng.integers(0, state.counts.size))
+    before = int(state.applied.reshape(-1)[place])
+    state.counts.reshape(-1)[place] = one_step(rng, before, operator)
+    return place
+
+
+def make_change_volume(rng):
+    shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    plane, volume = random_row(rng, state)
+    ahead = int(plane != state.clock[CLOCK_PLANE])
+    naive._gather(state.applied, ahead, volume, shape, operator, state)
+    filled = np.flatnonzero(state.values)
+    anywhere = len(filled) == 0 or rng.random() < 0.5
+    entry = int(rng.integers(0, len(state.values)) if anywhere else pick(rng, filled))
+    before = int(state.values[entry])
+    return plane, volume, entry, before, one_step(rng, before, operator), shape, operator, state
+
+
+def make_change_place(rng):
     shape, operator, state = parts_of(read_engine(rng))
-    if rng.random() < 0.5:  # what an offline window is encoded in
-        state = state._replace(
-            projections=state.projections[:1], moments=state.moments[:1], atoms=state.atoms[:1]
-        )
-    ring = copied(state.applied)
-    return ring, int(rng.integers(0, len(ring))), shape, operator, state
+    return changed_place(rng, operator, state), shape, operator, state
+
+
+def make_follow(rng):
+    engine = read_engine(rng)
+    events = hostile_events(rng, engine, int(rng.integers(0, 12)), 2.0)
+    near = rng.random(len(events)) < 0.5  # or most would be late
+    bin_us = engine.encoder.geometry.bin_us
+    events["t"][near] = np.sort(bin_start(engine) + rng.integers(0, 2 * bin_us + 1, near.sum()))
+    shape, operator, state = parts_of(engine)
+    return events, *engine.resolution, shape, operator, state
 
 
 def make_add_column(rng):
     column = rng.integers(-32767, 32768, 32).astype(np.int16)
     return np.int32(rng.integers(-100, 101)), frozen(column), random_code(rng, 32)
+
+
+def make_change_moments(rng):
+    _, _, moments = random_volume(rng)
+    return *(int(count) for count in rng.integers(-100, 101, 2)), moments
 
 
 def make_change_entry(rng):
@@ -414,7 +567,8 @@ def make_gather_volume(rng):
     height, width = (patch + int(more) for more in rng.integers(0, 6, 2))
     ring = rng.integers(-2, 3, (n_bins, height, width)).astype(np.int16)
     top, left = int(rng.integers(0, height - patch + 1)), int(rng.integers(0, width - patch + 1))
-    return ring, int(rng.integers(0, n_bins)), top, left, patch, values
+    first_slot, filled_bins = int(rng.integers(0, n_bins)), n_bins - int(rng.integers(0, 2))
+    return ring, first_slot, filled_bins, top, left, patch, values
 
 
 def make_project_volume(rng):
@@ -445,25 +599,33 @@ KERNELS = [
     Row(code.soft_code, make_soft_code),
     Row(code.triangle_code, make_triangle_code),
     Row(code.pool, make_pool),
+    Row(code.move_code, make_move_code),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
+    Row(ingest.count_event, make_count_event),
     Row(ingest.count_events, make_count_events),
     Row(lasso.duality_gap, make_duality_gap, close),
     Row(lasso.solve_lasso, make_solve_lasso, lasso_within_gap),
+    Row(lasso.subtract_row, make_subtract_row),
     Row(lasso.descend, make_descend, descended),
     Row(lasso.lasso_code, make_lasso_code, lasso_code_within_gap),
     Row(lasso.fix_atoms, make_fix_atoms),
     Row(lasso.solve_lasso_rows, make_solve_lasso_rows, rows_within_gap),
-    Row(update.quadrant, make_quadrant),
-    Row(update.covering, make_covering, same_range),
-    Row(update.encode_volume, make_encode_volume),
-    Row(update.pool_volume, make_pool_volume, exact_but_scratch),
-    Row(update.update, make_update, exact_but_atoms),
-    Row(update.rebuild, make_rebuild, exact_but_atoms),
-    Row(update.encode_ring, make_encode_ring, exact_but_atoms),
+    Row(encode.quadrant, make_quadrant),
+    Row(encode.covering, make_covering, same_range),
+    Row(encode.encode_volume, make_encode_volume),
+    Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
+    Row(planes.enter_volume, make_enter_volume, exact_but_atoms),
+    Row(planes.complete, make_complete, exact_but_atoms),
+    Row(planes.look_ahead, make_look_ahead, exact_but_atoms),
     Row(update.apply_touched, make_apply_touched, exact_but_atoms),
+    Row(update.update, make_update, exact_but_atoms),
+    Row(follow.change_volume, make_change_volume, exact_but_scratch),
+    Row(follow.change_place, make_change_place, exact_but_atoms),
+    Row(follow.follow, make_follow, exact_but_atoms),
     Row(volume.add_column, make_add_column),
+    Row(volume.change_moments, make_change_moments),
     Row(volume.change_entry, make_change_entry),
     Row(volume.gather_volume, make_gather_volume),
     Row(volume.project_volume, make_project_volume),

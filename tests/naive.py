@@ -1,6 +1,7 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 
@@ -8,15 +9,15 @@ from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
-    CLOCK_PROJECTED,
+    CLOCK_PLANE,
+    CLOCK_START,
     CLOCK_TOUCHED,
-    FIXED_POINT_ONE,
-    LARGEST_SQUARE,
     MOMENT_LINEAR,
     MOMENT_QUADRATIC,
     MOMENT_SQUARES,
     MOMENT_SUM,
     SPLIT,
+    TALLY_ENCODED,
     TALLY_EVENTS,
     TALLY_LATE,
     TALLY_REJECTED,
@@ -102,11 +103,11 @@ def deviation(moments, entries, eps):
 def whitened_square(moments, sigma, operator):
     quadratic = float(moments[MOMENT_QUADRATIC]) * operator.quadratic_scale / (sigma * sigma)
     linear = float(moments[MOMENT_LINEAR]) * operator.linear_scale / sigma
-    return float(np.clip(quadratic - 2 * linear + operator.constant, 0, LARGEST_SQUARE))
+    return float(np.clip(quadratic - 2 * linear + operator.constant, 0, operator.reach * operator.reach))
 
 
 def _scores(projection, sigma, operator):
-    gain = np.float32(operator.scale * FIXED_POINT_ONE / sigma)
+    gain = np.float32(operator.scale * operator.unit / sigma)
     return projection.astype(np.float32) * gain - operator.offset
 
 
@@ -117,7 +118,7 @@ def soft_code(projection, sigma, operator, code):
 
 def triangle_code(projection, sigma, square, operator, code):
     k = operator.n_filters
-    one = np.float32(FIXED_POINT_ONE)
+    one = np.float32(operator.unit)
     z = _scores(projection, sigma, operator)[:k] / one
     squares = np.float32(square) - np.float32(2) * z + operator.square_norms[:k]
     distances = (np.sqrt(np.maximum(squares, np.float32(0))) * one).astype(np.int64)
@@ -131,42 +132,67 @@ def pool(code, sign, kind, pooled):
     pooled += sign * np.concatenate(parts)
 
 
+def move_code(change, column, projection, sigma_before, sigma_after, operator, pooled):
+    code = np.zeros(len(projection), np.int32)
+    soft_code(projection, sigma_before, operator, code)
+    pool(code, -1, operator.kind, pooled)
+    add_column(change, column, projection)
+    soft_code(projection, sigma_after, operator, code)
+    pool(code, 1, operator.kind, pooled)
+
+
 # streamfeat.kernels.ingest
 
 
-def advance_to_bin(new, state):
-    n_bins, now = len(state.counts), int(state.clock[CLOCK_NOW])
+def advance_to_bin(new, operator, state):
+    clock = state.clock
+    n_bins, now, plane = len(state.counts), int(clock[CLOCK_NOW]), int(clock[CLOCK_PLANE])
     if new <= now:
         return
     before = set(range(now - n_bins + 1, now + 1))
     for bin_index in set(range(new - n_bins + 1, new + 1)) - before:
         state.counts[bin_index % n_bins] = 0
+        state.applied[bin_index % n_bins] = 0
     if now != BEFORE_TIME:
         state.tally[TALLY_ROLLS] += new - now
-    state.clock[CLOCK_NOW] = new
+    clock[CLOCK_NOW] = new
+    clock[CLOCK_START] = int(clock[CLOCK_ORIGIN]) + new * operator.bin_us
+    planes = {0, 1} if len(state.cursors) == 2 else {0}
+    (clock[CLOCK_PLANE],) = planes - {plane} or {0}
+    looked_ahead = planes - {plane} if new == now + 1 else set()
+    for other in planes - looked_ahead:
+        state.cursors[other] = 0
+        state.pooled[other] = 0
+
+
+def count_event(x, y, p, t, height, width, operator, state):
+    counts, clock, tally = state.counts, state.clock, state.tally
+    n_bins, limit = len(counts), operator.max_count
+    if not (x < width and y < height and p in (0, 1) and abs(int(t)) < 2**62):
+        tally[TALLY_REJECTED] += 1
+        return -1
+    bin_index = (int(t) - int(clock[CLOCK_ORIGIN])) // operator.bin_us
+    advance_to_bin(bin_index, operator, state)
+    if bin_index not in range(clock[CLOCK_NOW] - n_bins + 1, clock[CLOCK_NOW] + 1):
+        tally[TALLY_LATE] += 1
+        return -1
+    tally[TALLY_EVENTS] += 1
+    entry = bin_index % n_bins, y // operator.downsample, x // operator.downsample
+    before = np.clip(counts[entry], -limit, limit)
+    counts[entry] += {0: -1, 1: 1}[p]
+    if np.clip(counts[entry], -limit, limit) == before:
+        tally[TALLY_SATURATED] += 1
+        return -1
+    return int(np.ravel_multi_index(entry, counts.shape))
 
 
 def count_events(events, height, width, operator, state):
-    counts, clock, tally = state.counts, state.clock, state.tally
-    n_bins, limit = len(counts), operator.max_count
-    for x, y, p, t in events.tolist():
-        if not (x < width and y < height and p in (0, 1) and abs(t) < 2**62):
-            tally[TALLY_REJECTED] += 1
-            continue
-        bin_index = (t - int(clock[CLOCK_ORIGIN])) // operator.bin_us
-        advance_to_bin(bin_index, state)
-        if bin_index not in range(clock[CLOCK_NOW] - n_bins + 1, clock[CLOCK_NOW] + 1):
-            tally[TALLY_LATE] += 1
-            continue
-        tally[TALLY_EVENTS] += 1
-        entry = bin_index % n_bins, y // operator.downsample, x // operator.downsample
-        before = np.clip(counts[entry], -limit, limit)
-        counts[entry] += {0: -1, 1: 1}[p]
-        if np.clip(counts[entry], -limit, limit) == before:
-            tally[TALLY_SATURATED] += 1
-        elif not state.is_touched[entry]:
-            state.is_touched[entry] = 1
-            state.touched[clock[CLOCK_TOUCHED]] = np.ravel_multi_index(entry, counts.shape)
+    on_stack, clock = state.is_touched.reshape(-1), state.clock
+    for event in events.tolist():
+        place = count_event(*event, height, width, operator, state)
+        if place >= 0 and not on_stack[place]:
+            on_stack[place] = 1
+            state.touched[clock[CLOCK_TOUCHED]] = place
             clock[CLOCK_TOUCHED] += 1
 
 
@@ -206,25 +232,34 @@ def solve_lasso(right, square, penalty, gram, gap, start, atoms, residual, activ
     return duality_gap(residual, right, atoms, square, penalty) / max(square / 2, 1e-300)
 
 
-def descend(active, penalty, gram, tolerance, atoms, residual):
-    part = gram[np.ix_(active, active)].astype(np.float64)
-    right = residual[active] + part @ atoms[active]
-    atoms[active] = _shrunken_gradient_steps(right, penalty, part, atoms[active])
-    residual[active] = right - part @ atoms[active]
+def subtract_row(step, row, residual):
+    residual -= step * row.astype(np.float64)
+
+
+def descend(active, penalty, gram, atoms, residual):
+    gram = gram.astype(np.float64)
+    right = residual + gram @ atoms
+    for j in active:
+        rest = atoms.copy()
+        rest[j] = 0
+        target = right[j] - gram[j] @ rest
+        atoms[j] = np.sign(target) * max(abs(target) - penalty, 0) / gram[j, j]
+    residual[:] = right - gram @ atoms
 
 
 def lasso_code(projection, sigma, square, operator, atoms, work, active):
     k = len(atoms)
-    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / FIXED_POINT_ONE
+    right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / operator.unit
     solution, residual = np.zeros(k), np.zeros(k)
-    penalty = operator.threshold / FIXED_POINT_ONE
+    penalty = operator.threshold / operator.unit
     solve_lasso(right, square, penalty, operator.gram, operator.gap, atoms, solution, residual, None)
     atoms[:] = solution
 
 
-def fix_atoms(atoms, code):
+def fix_atoms(atoms, operator, code):
+    largest = operator.reach * operator.reach / (2 * operator.threshold / operator.unit)
     code[:] = 0
-    code[: len(atoms)] = np.trunc((atoms.astype(np.float64) * FIXED_POINT_ONE).clip(-(2**31 - 1), 2**31 - 1))
+    code[: len(atoms)] = np.trunc(atoms.astype(np.float64).clip(-largest, largest) * operator.unit)
 
 
 def solve_lasso_rows(right, squares, penalty, gram, gap, codes):
@@ -241,8 +276,14 @@ def add_column(change, column, projection):
     projection += change * column.astype(np.int32)
 
 
-def gather_volume(ring, first_slot, top, left, patch, values):
+def change_moments(before, after, moments):
+    moments[MOMENT_SUM] += int(after) - int(before)
+    moments[MOMENT_SQUARES] += int(after) ** 2 - int(before) ** 2
+
+
+def gather_volume(ring, first_slot, filled_bins, top, left, patch, values):
     oldest_first = np.roll(ring, -first_slot, axis=0)
+    oldest_first[filled_bins:] = 0
     values[:] = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
     return np.count_nonzero(values)
 
@@ -267,12 +308,12 @@ def change_entry(entry, before, after, values, operator, projection, moments):
     moments += sums[1] - sums[0]
 
 
-# streamfeat.kernels.update
+# streamfeat.kernels.encode
 
 
-def quadrant(volume, rows, columns):
-    row, column = divmod(volume, columns)
-    is_low, is_right = row >= rows / 2, column >= columns / 2
+def quadrant(volume, shape):
+    row, column = divmod(volume, shape[1])
+    is_low, is_right = row >= shape[0] / 2, column >= shape[1] / 2
     return [[0, 1], [2, 3]][is_low][is_right]
 
 
@@ -293,55 +334,133 @@ def encode_volume(projection, moments, atoms, fresh, operator, state):
     if operator.inverse:
         if fresh:
             lasso_code(projection, sigma, square, operator, atoms, None, None)
-        fix_atoms(atoms, state.code)
+        fix_atoms(atoms, operator, state.code)
     elif operator.kind == TRIANGLE:
         triangle_code(projection, sigma, square, operator, state.code)
     else:
         soft_code(projection, sigma, operator, state.code)
 
 
-def pool_volume(volume, sign, shape, operator, state):
-    projection, moments, atoms = state.projections[volume], state.moments[volume], state.atoms[volume]
-    encode_volume(projection, moments, atoms, sign > 0, operator, state)
-    pool(state.code, sign, operator.kind, state.pooled[quadrant(volume, *shape)])
+def pool_volume(plane, row, volume, sign, shape, operator, state):
+    row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
+    encode_volume(*row_of, sign > 0, operator, state)
+    pool(state.code, sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+    state.tally[TALLY_ENCODED] += sign > 0
 
 
-def encode_ring(ring, first_slot, shape, operator, state):
-    state.pooled[:] = 0
-    filled = 0
-    for volume, (r, c) in enumerate(np.ndindex(*shape)):
-        kept = volume if len(state.projections) > 1 else 0
-        projection, moments, atoms = state.projections[kept], state.moments[kept], state.atoms[kept]
-        top, left = r * operator.stride, c * operator.stride
-        filled += gather_volume(ring, first_slot, top, left, operator.patch, state.values) > 0
-        project_volume(state.values, operator, projection, moments)
-        encode_volume(projection, moments, atoms, True, operator, state)
-        pool(state.code, 1, operator.kind, state.pooled[quadrant(volume, *shape)])
+# streamfeat.kernels.planes
+
+
+def _first_pixels(volume, shape, operator):
+    return [index * operator.stride for index in divmod(volume, shape[1])]
+
+
+def _gather(ring, ahead, volume, shape, operator, state):
+    """Entries of a volume as they are after `ahead` more bins; how many are not zero."""
+    n_bins, now = len(ring), int(state.clock[CLOCK_NOW])
+    top, left = _first_pixels(volume, shape, operator)
+    first_slot = (now + 1 + ahead) % n_bins
+    return gather_volume(ring, first_slot, n_bins - ahead, top, left, operator.patch, state.values)
+
+
+def enter_volume(plane, ahead, shape, operator, state):
+    volume = int(state.cursors[plane])
+    state.cursors[plane] += 1
+    row = volume if state.projections.shape[1] > 1 else 0
+    filled = _gather(state.applied, ahead, volume, shape, operator, state)
+    project_volume(state.values, operator, state.projections[plane, row], state.moments[plane, row])
+    if filled:
+        pool_volume(plane, row, volume, 1, shape, operator, state)
+    else:
+        state.atoms[plane, row] = 0
     return filled
 
 
-def rebuild(shape, operator, state):
-    state.is_touched[:] = 0
-    state.applied[:] = state.counts.clip(-operator.max_count, operator.max_count)
-    state.clock[CLOCK_TOUCHED] = 0
-    state.clock[CLOCK_PROJECTED] = state.clock[CLOCK_NOW]
-    first_slot = (int(state.clock[CLOCK_NOW]) + 1) % len(state.counts)
-    return encode_ring(state.applied, first_slot, shape, operator, state)
+def complete(shape, operator, state):
+    plane = int(state.clock[CLOCK_PLANE])
+    for _ in range(int(state.cursors[plane]), shape[0] * shape[1]):
+        enter_volume(plane, 0, shape, operator, state)
+
+
+def look_ahead(goal, budget, shape, operator, state):
+    current, volumes = int(state.clock[CLOCK_PLANE]), shape[0] * shape[1]
+    if len(state.cursors) == 1 or state.cursors[current] != volumes:
+        return budget
+    plane = 1 - current
+    for volume in range(int(state.cursors[plane]), min(goal, volumes)):
+        if budget <= 0:
+            break
+        was_filled = state.moments[plane, volume].any()
+        is_filled = _gather(state.applied, 0, volume, shape, operator, state) > 0
+        filled = enter_volume(plane, 1, shape, operator, state)
+        if was_filled or is_filled:
+            budget -= 4 + filled
+    return budget
+
+
+# streamfeat.kernels.update
+
+
+def _follow_counts(after, shape, operator, state):
+    """Every volume of every plane from the clipped counts `after`; lasso codes again where they changed."""
+    before = state.applied.copy()
+    state.applied[:] = after
+    encoded = 0
+    for plane, cursor in enumerate(state.cursors):
+        ahead = int(plane != state.clock[CLOCK_PLANE])
+        state.pooled[plane] = 0
+        for volume in range(cursor):
+            _gather(before, ahead, volume, shape, operator, state)
+            old = state.values.copy()
+            _gather(after, ahead, volume, shape, operator, state)
+            changed = bool((state.values != old).any())
+            encoded += changed
+            row_of = [field[plane, volume] for field in (state.projections, state.moments, state.atoms)]
+            project_volume(state.values, operator, *row_of[:2])
+            encode_volume(*row_of, changed, operator, state)
+            pool(state.code, 1, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+    state.tally[TALLY_ENCODED] += encoded
 
 
 def apply_touched(shape, operator, state):
-    changed = state.counts.clip(-operator.max_count, operator.max_count) != state.applied
-    dirty = 0
-    for r, c in np.ndindex(*shape):
-        top, left = r * operator.stride, c * operator.stride
-        dirty += changed[:, top : top + operator.patch, left : left + operator.patch].any()
-    rebuild(shape, operator, state)
-    return dirty
+    clipped = state.counts.clip(-operator.max_count, operator.max_count).astype(np.int16)
+    _follow_counts(clipped, shape, operator, state)
+    state.is_touched[:] = 0
+    state.clock[CLOCK_TOUCHED] = 0
 
 
 def update(shape, operator, state):
-    is_current = state.clock[CLOCK_PROJECTED] == state.clock[CLOCK_NOW]
-    return apply_touched(shape, operator, state) if is_current else rebuild(shape, operator, state)
+    apply_touched(shape, operator, state)
+    complete(shape, operator, state)
+
+
+# streamfeat.kernels.follow
+
+
+def change_volume(plane, volume, entry, before, after, shape, operator, state):
+    pool_volume(plane, volume, volume, -1, shape, operator, state)
+    row_of = state.projections[plane, volume], state.moments[plane, volume]
+    change_entry(entry, before, after, state.values, operator, *row_of)
+    pool_volume(plane, volume, volume, 1, shape, operator, state)
+
+
+def change_place(place, shape, operator, state):
+    after = state.applied.copy()
+    after.reshape(-1)[place] = np.clip(
+        state.counts.reshape(-1)[place], -operator.max_count, operator.max_count
+    )
+    _follow_counts(after, shape, operator, state)
+
+
+def follow(events, height, width, shape, operator, state):
+    for event in events.tolist():
+        place = count_event(*event, height, width, operator, state)
+        complete(shape, operator, state)
+        if place >= 0:
+            change_place(place, shape, operator, state)
+        part_of_bin = Fraction(event[3] - int(state.clock[CLOCK_START]), operator.bin_us)
+        goal = math.floor(shape[0] * shape[1] * min(max(part_of_bin, 0), 1) * Fraction(5, 4))
+        look_ahead(goal, 96, shape, operator, state)
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

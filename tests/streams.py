@@ -56,8 +56,8 @@ class Case:
             rng, self.geometry, self.n_filters, self.formulation, self.encoding, threshold=self.threshold
         )
 
-    def engine(self, origin_us=0):
-        return Engine(self.encoder, self.resolution, origin_us=origin_us)
+    def engine(self, origin_us=0, *, look_ahead=False):
+        return Engine(self.encoder, self.resolution, origin_us=origin_us, look_ahead=look_ahead)
 
 
 @st.composite
@@ -116,7 +116,10 @@ def random_events(rng, geometry, resolution, n, n_windows=3.0):
 
 
 def fed_in_every_way(make_engine, events, rng):
-    """Engines that were fed the same events: `(how, engine)`, the first one in a single batch."""
+    """Engines that were fed the same events: `(how, engine)`, the first one in a single batch.
+
+    `make_engine` takes `look_ahead`.
+    """
     whole = make_engine()
     whole.feed(events)
     yield "whole", whole
@@ -157,3 +160,49 @@ def fed_in_every_way(make_engine, events, rng):
             told_the_time.advance(latest - int(rng.integers(0, 3)))
             told_the_time.advance(latest)
     yield "told the time after each event", told_the_time
+
+    for look_ahead in (False, True):
+        how = ", looking ahead" if look_ahead else ""
+
+        followed = make_engine(look_ahead=look_ahead)
+        followed.follow(events)
+        yield f"followed{how}", followed
+
+        cut = make_engine(look_ahead=look_ahead)
+        for batch in np.split(events, cuts):
+            cut.follow(batch)
+            cut.follow(events[:0])
+        yield f"followed in batches{how}", cut
+
+        mixed = make_engine(look_ahead=look_ahead)
+        for _ in mixed_steps(mixed, events, rng):
+            pass
+        yield f"in a mix of all ways{how}", mixed
+
+
+def mixed_steps(engine, events, rng):
+    """Feed or follow random batches, and in between read, prepare, tell the time; yields after each batch.
+
+    Yields:
+        how many events are in, and the latest time that the engine was told, or None.
+    """
+    told = None
+    end = 0
+    while end < len(events):
+        start, end = end, min(end + int(rng.choice([1, 1, 2, 5, 20])), len(events))
+        batch = events[start:end]
+        (engine.follow if rng.random() < 0.5 else engine.feed)(batch)
+        for _ in range(rng.integers(0, 3)):
+            what = rng.integers(0, 4)
+            if what == 0:
+                engine.features()
+            elif what == 1:
+                engine.prepare(int(rng.choice([1, 20, 500, 10**6])))
+            elif what == 2 and told is not None:
+                engine.advance(told - int(rng.integers(0, 3)))
+        height, width = engine.resolution
+        good = (batch["x"] < width) & (batch["y"] < height) & (batch["p"] >> 1 == 0)
+        if good.any():
+            latest = int(batch["t"][good].max())
+            told = latest if told is None else max(told, latest)
+        yield end, told

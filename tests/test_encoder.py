@@ -4,10 +4,11 @@ import dataclasses
 import json
 from pathlib import Path
 
+import naive
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
-from streams import KINDS, random_encoder, random_events
+from streams import KINDS, LASSO_KINDS, random_encoder, random_events
 
 from streamfeat import safe_arrays
 from streamfeat.encoder import Encoder
@@ -15,6 +16,8 @@ from streamfeat.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.files import replacing, write_atomically
 from streamfeat.geometry import Geometry
+from streamfeat.kernels.layout import TRIANGLE
+from streamfeat.operator import with_fixed_point
 
 ids = "-".join
 
@@ -145,6 +148,109 @@ def test_volumes_of_one_entry_have_nothing_but_a_mean(kind):
     assert np.isfinite(encoder.encode(events, RESOLUTION)).all()
 
 
+# The fixed point
+
+
+def test_the_unit_is_the_largest_power_of_two_that_fits():
+    operator = known_encoder().operator._replace(largest=5000.0)
+    # 5 x 6 volumes: at most 3 x 3 share a sum, 45000 together. 2^15 x 45000 = 1474560000 < 2^31 - 1.
+    pooling = with_fixed_point(operator, (5, 6))
+    assert pooling.unit == 2.0**15
+    np.testing.assert_array_equal(pooling.offset, operator.offset * np.float32(2**15), strict=True)
+    assert pooling.threshold == operator.threshold * 2**15
+    assert not pooling.offset.flags.writeable
+    assert operator.unit == 1.0
+    assert with_fixed_point(operator, (1, 1)).unit == 2.0**16  # never finer
+    assert with_fixed_point(operator._replace(largest=1e-9), (1, 1)).unit == 2.0**16
+
+
+def test_no_pooled_sum_can_overflow_and_no_bit_is_given_away():
+    rng = np.random.default_rng(4)
+    operator = known_encoder().operator
+    for _ in range(200):
+        rows, columns = (int(side) for side in rng.integers(1, 60, 2))
+        largest = float(10 ** rng.uniform(-2, 3.5))
+        unit = with_fixed_point(operator._replace(largest=largest), (rows, columns)).unit
+        volumes = ((rows + 1) // 2) * ((columns + 1) // 2)
+        assert unit * largest * volumes <= 2**31 - 1
+        assert unit == 2.0**16 or 2 * unit * max(largest, 1.0) * volumes > 2**31 - 1
+        assert unit >= 2.0**8
+        assert np.log2(unit).is_integer()
+
+
+def test_fewer_than_eight_bits_are_refused_with_the_arithmetic():
+    operator = known_encoder().operator
+    most = (2**31 - 1) / 2**8 / 9
+    assert with_fixed_point(operator._replace(largest=0.999 * most), (5, 6)).unit == 2.0**8
+    message = refused(with_fixed_point, operator._replace(largest=1.001 * most), (5, 6))
+    assert f"could reach {1.001 * most:.4g} x 9 volumes of a quadrant" in message
+    assert "leaves 7 bits behind the point of an int32, 8 are needed; raise the stride" in message
+    assert "leaves -3 bits" in refused(with_fixed_point, operator._replace(largest=2.0**30), (5, 6))
+    for largest in (float("inf"), float("nan")):
+        refused(with_fixed_point, operator._replace(largest=largest), (5, 6))
+
+
+def test_a_sensor_of_too_many_volumes_is_refused():
+    encoder = build(filters=3e4 * np.eye(D)[:5], threshold=1.0)
+    build_engine = lambda side: Engine(encoder, (side, side))  # noqa: E731
+    assert build_engine(8)._operator.unit >= 2.0**8
+    for make in (build_engine, lambda side: encoder.encode(EVENTS, (side, side))):
+        assert "volumes of a quadrant" in refused(make, 400)
+
+
+def extreme_volumes(rng, operator, geometry):
+    """Volumes that reach as far as volumes can: all at the limit, one, half, along a filter."""
+    limit, d = geometry.max_count, geometry.entries
+    yield from limit * np.eye(d, dtype=np.int64)
+    yield np.full(d, limit)
+    yield np.full(d, -limit)
+    nearly = np.full(d, limit)
+    nearly[0] = limit - 1
+    yield nearly
+    for k in range(operator.n_filters):
+        along = operator.columns[:, k].astype(np.int64)
+        yield limit * np.sign(along)
+        yield -limit * np.sign(along)
+        yield np.rint(limit * along / max(np.abs(along).max(), 1)).astype(np.int64)
+    for _ in range(40):
+        yield rng.integers(-limit, limit + 1, d) * (rng.random(d) < rng.random())
+    for _ in range(20):
+        yield np.where(rng.random(d) < rng.random(), limit, -limit)
+
+
+@pytest.mark.parametrize("max_count", [1, 200])
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_no_code_and_no_number_on_the_way_to_it_exceeds_the_largest(kind, max_count):
+    geometry = dataclasses.replace(GEOMETRY, max_count=max_count)
+    rng = np.random.default_rng(6)
+    reached = 0.0
+    for eps in (1e-6, 0.01):
+        encoder = random_encoder(rng, geometry, 5, *kind, eps=eps, threshold=0.02)
+        operator, square = encoder.operator, 0.0
+        assert 1 <= operator.largest < np.inf
+        for values in extreme_volumes(rng, operator, geometry):
+            if not values.any():
+                continue
+            projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
+            naive.project_volume(values.astype(np.int16), operator, projection, moments)
+            sigma = naive.deviation(moments, geometry.entries, eps)
+            numbers = np.abs(naive._scores(projection, sigma, operator)).max()
+            if operator.quadratic.size:
+                square = naive.whitened_square(moments, sigma, operator._replace(reach=1e9))
+                assert square <= operator.reach**2 * (1 + 1e-6)
+            if operator.kind == TRIANGLE:
+                z = naive._scores(projection, sigma, operator)[:5]
+                numbers = max(numbers, np.sqrt(max((square - 2 * z + operator.square_norms[:5]).max(), 0)))
+            if operator.inverse:
+                code = np.zeros(5, np.float32)
+                naive.lasso_code(projection, sigma, square, operator, code, None, None)
+                numbers = max(numbers, np.abs(code).max())
+            assert numbers <= operator.largest * (1 + 1e-6)
+            reached = max(reached, numbers / operator.largest)
+    if kind not in LASSO_KINDS and max_count == 1:
+        assert reached > 0.2  # no bits are wasted
+
+
 # What cannot be built
 
 D = GEOMETRY.entries
@@ -186,12 +292,12 @@ def build(geometry=GEOMETRY, **parameters):
         ({"eps": float("inf")}, "eps, scale and gap"),
         ({"gap": 0.0}, "eps, scale and gap"),
         ({"gap": 1.0}, "eps, scale and gap"),
-        ({"filters": 1e6 * np.eye(D)}, "a code could reach"),
+        ({"filters": 1e7 * np.eye(D)}, "code could reach"),
         ({"filters": 1e30 * np.eye(D)}, "finite|squared length|code could reach"),
         ({"filters": 1e30 * np.eye(D), "formulation": "inverse"}, "finite|squared|code could reach"),
         ({"whitening": 1e30 * np.eye(D), "encoding": "triangle"}, "whitening must be finite"),
         ({"mean": np.full(D, 1e30)}, "mean must be finite"),
-        ({"mean": np.full(D, 1e6)}, "a code could reach"),
+        ({"mean": np.full(D, 1e7)}, "code could reach"),
         (
             {name: np.full((D, D)[: 1 + (name != "mean")], 1e8) for name in ("filters", "whitening", "mean")},
             "code could reach",
@@ -200,6 +306,14 @@ def build(geometry=GEOMETRY, **parameters):
 )
 def test_what_is_no_encoder_is_refused(parameters, says):
     refused(build, match=says, **parameters)
+
+
+def test_a_column_that_cannot_be_negated_is_refused(saved):
+    """A count that goes down takes its column away: -32768 has no negative in int16."""
+    columns = load_file(saved)["columns"].copy()
+    columns[0, 0] = -(2**15)
+    rewrite(saved, {"columns": columns})
+    assert "columns must lie between -32767 and 32767" in refused(Encoder.load, saved)
 
 
 def test_an_integer_that_could_overflow_is_refused_with_the_arithmetic():

@@ -12,7 +12,10 @@ from streamfeat.engine import Engine, EngineStats
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, make_events
 from streamfeat.geometry import Geometry
+from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import count_events
+from streamfeat.kernels.layout import CLOCK_PLANE
+from streamfeat.kernels.update import update
 
 ids = "-".join
 
@@ -52,11 +55,12 @@ def test_what_is_no_batch_is_refused_and_changes_nothing(batch):
     engine = known_case().engine()
     engine.feed(some_events(known_case()))
     features, stats = engine.features(), engine.stats()
-    with pytest.raises(InputError) as error:
-        engine.feed(batch)
-    assert one_line(error)
-    np.testing.assert_array_equal(engine.features(), features)
-    assert engine.stats() == stats
+    for take in (engine.feed, engine.follow):
+        with pytest.raises(InputError) as error:
+            take(batch)
+        assert one_line(error)
+        np.testing.assert_array_equal(engine.features(), features)
+        assert engine.stats() == stats
 
 
 def read_only(events):
@@ -79,17 +83,18 @@ def unaligned(events):
     return np.frombuffer(room, EVENT_DTYPE, offset=1)
 
 
+@pytest.mark.parametrize(("way", "kernel"), [("feed", count_events), ("follow", follow)])
 @pytest.mark.parametrize("form", [read_only, strided, backwards, unaligned])
-def test_batches_of_any_memory_layout_mean_the_same(form):
+def test_batches_of_any_memory_layout_mean_the_same(form, way, kernel):
     case = known_case()
     events = some_events(case)
     expected, engine = case.engine(), case.engine()
-    expected.feed(events)
-    compiled = len(count_events.signatures)
+    getattr(expected, way)(events)
+    compiled = len(kernel.signatures)
     batch = form(events)
-    engine.feed(batch)
+    getattr(engine, way)(batch)
     assert batch.tolist() == events.tolist()
-    assert len(count_events.signatures) == compiled  # or the first such batch would take seconds
+    assert len(kernel.signatures) == compiled  # or the first such batch would take seconds
     np.testing.assert_array_equal(engine.features(), expected.features(), strict=True)
 
 
@@ -126,6 +131,31 @@ def test_a_jump_to_the_end_of_time_empties_the_window_and_stays_there():
     with pytest.raises(InputError) as error:
         engine.advance(2**62)
     assert one_line(error)
+
+
+@pytest.mark.parametrize("origin_us", [2**62, -(2**62), 2**63, -(2**70)])
+def test_an_origin_beyond_time_is_refused_and_changes_nothing(origin_us):
+    case = known_case()
+    with pytest.raises(InputError, match=r"beyond 2\^62") as error:
+        case.engine(origin_us=origin_us)
+    assert one_line(error)
+    engine = case.engine()
+    engine.feed(some_events(case))
+    features = engine.features()
+    assert features.any()
+    with pytest.raises(InputError, match=r"beyond 2\^62"):
+        engine.restart(origin_us)
+    np.testing.assert_array_equal(engine.features(), features)
+
+
+@pytest.mark.parametrize("origin_us", [2**62 - 1, -(2**62) + 1])
+def test_an_origin_at_the_end_of_time_is_an_origin(origin_us):
+    case = known_case()
+    engine, event = case.engine(origin_us=origin_us), make_events([5], [5], [1], [origin_us])
+    engine.follow(event)
+    offline = case.encoder.encode(event, case.resolution, origin_us=origin_us)
+    np.testing.assert_array_equal(engine.features(), offline)
+    assert offline.any()
 
 
 def test_a_sensor_too_small_for_a_volume_is_refused():
@@ -244,10 +274,26 @@ def test_a_restored_engine_goes_on_within_the_gap(kind):
     engine.features()
     other.restore(engine.snapshot())
     np.testing.assert_array_equal(other.snapshot().counts, engine.snapshot().counts)
-    np.testing.assert_array_equal(other.snapshot().atoms, engine.snapshot().atoms)
+    # Solved again from a code that was rounded to float32, which may be just outside the gap.
+    np.testing.assert_allclose(other.snapshot().atoms, engine.snapshot().atoms, atol=1e-4)
+    assert_certified(other._operator, other._state)
     other.feed(second)
     other.features()
-    assert_certified(case.encoder.operator, other._state)
+    assert_certified(other._operator, other._state)
+
+
+@pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)
+def test_no_code_of_a_snapshot_outlives_its_volume(kind):
+    case = known_case(kind)
+    engine, other = case.engine(), case.engine(look_ahead=True)
+    engine.feed(some_events(case))
+    assert engine.snapshot().atoms.any()
+    other.restore(engine.snapshot())
+    assert other.stats() == engine.stats()
+    end = 10 * case.geometry.window_us
+    other.advance(end)
+    assert not other.features().any()
+    assert not other.snapshot().atoms.any()
 
 
 def test_a_snapshot_of_an_engine_that_saw_nothing_is_an_empty_engine():
@@ -267,10 +313,12 @@ def test_a_snapshot_of_an_engine_that_saw_nothing_is_an_empty_engine():
         known_case(resolution=(31, 50)),
         known_case(geometry=Geometry(patch=4, stride=3, n_bins=4, bin_us=1000, downsample=2, max_count=2)),
         known_case(("inverse", "soft")),
+        known_case(("direct", "split")),
+        Case(GEOMETRY, (31, 42), 33, "direct", "soft", 0.1, 4),
     ],
-    ids=["sensor", "bins", "formulation"],
+    ids=["sensor", "bins", "formulation", "encoding", "filters"],
 )
-def test_a_snapshot_of_another_geometry_is_refused_and_changes_nothing(other):
+def test_a_snapshot_of_another_encoder_or_sensor_is_refused_and_changes_nothing(other):
     engine = known_case().engine()
     engine.feed(some_events(known_case()))
     features = engine.features()
@@ -345,13 +393,105 @@ def test_saturation_is_remembered_beyond_the_clip():
     np.testing.assert_array_equal(engine.features(), plain.features())
 
 
+# Looking ahead
+
+
+def a_full_window(case):
+    """An engine that looks ahead, with events in each bin of its window, and the time of the next bin."""
+    rng, bin_us = np.random.default_rng(2), case.geometry.bin_us
+    engine = case.engine(look_ahead=True)
+    height, width = case.resolution
+    n = 60 * case.geometry.n_bins
+    times = np.sort(rng.integers(0, case.geometry.window_us, n))
+    events = make_events(rng.integers(0, width, n), rng.integers(0, height, n), rng.integers(0, 2, n), times)
+    engine.feed(events)
+    return engine, events, case.geometry.n_bins * bin_us
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_a_boundary_that_was_prepared_encodes_nothing(kind):
+    case = known_case(kind)
+    prepared, events, boundary = a_full_window(case)
+    unprepared, _, _ = a_full_window(case)
+    for engine in (prepared, unprepared):
+        engine.features()
+    calls = 0
+    while not prepared.prepare(20):
+        calls += 1
+    assert calls > 5  # in slices
+    before = prepared.stats().encoded_volumes, unprepared.stats().encoded_volumes
+    for engine in (prepared, unprepared):
+        engine.advance(boundary)
+    features = prepared.features()
+    assert features.any()
+    assert prepared.stats().encoded_volumes == before[0]
+    unprepared.features()
+    active = unprepared.stats().active_volumes
+    assert unprepared.stats().encoded_volumes == before[1] + active
+    assert active > 5
+    if kind in EXACT_KINDS:
+        offline = case.encoder.encode(events, case.resolution, origin_us=0, t_us=boundary)
+        np.testing.assert_array_equal(features, offline)
+    else:
+        assert_certified(prepared._operator, prepared._state)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_events_after_preparing_are_in_what_was_prepared(kind):
+    case = known_case(kind)
+    engine, events, boundary = a_full_window(case)
+    while not engine.prepare(10**6):
+        pass
+    more = make_events(
+        [5, 20, 30, 5], [5, 20, 9, 5], [1, 0, 1, 1], [boundary - 1, 0, boundary - 1, boundary - 1500]
+    )
+    engine.feed(more[:2])
+    engine.features()
+    engine.follow(more[2:])
+    before = engine.stats().encoded_volumes
+    engine.advance(boundary)
+    features = engine.features()
+    assert engine.stats().encoded_volumes == before
+    if kind in EXACT_KINDS:
+        everything = np.concatenate([events, more])
+        offline = case.encoder.encode(everything, case.resolution, origin_us=0, t_us=boundary)
+        np.testing.assert_array_equal(features, offline)
+    else:
+        assert_certified(engine._operator, engine._state)
+
+
+def test_following_prepares_the_boundary_before_four_fifths_of_the_bin():
+    case = known_case()
+    engine, _, boundary = a_full_window(case)
+    engine.features()
+    bin_us, volumes = case.geometry.bin_us, engine.grid_shape[0] * engine.grid_shape[1]
+    start = boundary - bin_us
+    for t in range(start, start + bin_us * 4 // 5, 4):
+        before = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]]
+        engine.follow(make_events([5], [5], [t // 4 % 2], [t]))
+        after = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]]
+        assert after - before <= 5  # spread out
+        assert after <= (t - start + 1) * volumes * 1.25 / bin_us
+    engine.follow(make_events([5], [5], [1], [start + bin_us * 4 // 5]))
+    assert engine._state.cursors.tolist() == [volumes, volumes]
+    assert engine.prepare(1)
+
+
+def test_nothing_is_left_to_prepare_for_an_engine_that_does_not_look_ahead():
+    case = known_case()
+    engine = case.engine()
+    engine.feed(some_events(case))
+    assert engine.prepare(1)
+    assert not case.engine(look_ahead=True).prepare(0)
+
+
 # Memory
 
 
 @pytest.mark.parametrize("kind", [("direct", "split"), ("inverse", "soft")], ids=ids)
 def test_nothing_is_allocated_after_warm_up(kind):
     case = known_case(kind)
-    engine = Engine(case.encoder, case.resolution)
+    engine = Engine(case.encoder, case.resolution, look_ahead=True)
     batches = [some_events(case, 2000, seed) for seed in range(4)]
     for i, batch in enumerate(batches):
         batch["t"] += i * 2 * case.geometry.window_us
@@ -360,7 +500,9 @@ def test_nothing_is_allocated_after_warm_up(kind):
         for batch in batches:
             engine.feed(batch)
             engine.advance(int(batch["t"][-1]) + case.geometry.bin_us)
-            engine._update()
+            update(engine.grid_shape, engine._operator, engine._state)
+            engine.prepare(1000)
+            engine.follow(batch[-20:])
 
     work()
     addresses = [array.ctypes.data for array in engine._state]

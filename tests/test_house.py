@@ -16,8 +16,10 @@ LAYERS = [
     {"errors", "events", "kernels.layout"},
     {"geometry", "files", "messages", "mcap_records", "svm", "simulate"},
     {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
-    {"kernels.update", "codecs", "safe_arrays"},
-    {"state", "recording"},
+    {"kernels.encode", "codecs", "safe_arrays"},
+    {"kernels.planes"},
+    {"kernels.update", "kernels.follow"},
+    {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
     {"encoder", "sinks"},
     {"engine", "classifier", "features", "foreign", "learn"},
@@ -40,7 +42,7 @@ ONLY_IN = {
     "zenoh": {"live"},
     "typer": {"cli"},
     "numba": {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"}
-    | {"kernels.update"},
+    | {"kernels.encode", "kernels.planes", "kernels.update", "kernels.follow"},
 }
 
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}

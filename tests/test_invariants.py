@@ -1,5 +1,6 @@
 """What streaming may never change: five invariants and the mathematics, on random and on real events."""
 
+import copy
 import runpy
 
 import naive
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kernel_table import assert_certified
+from kernel_table import assert_certified, assert_pooled, copied
 from streams import (
     EXACT_KINDS,
     GAP,
@@ -16,6 +17,7 @@ from streams import (
     Case,
     cases,
     fed_in_every_way,
+    mixed_steps,
     random_encoder,
     random_events,
     streams,
@@ -25,14 +27,30 @@ from streamfeat.engine import Engine
 from streamfeat.events import make_events
 from streamfeat.foreign.event_files import open_events
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import CLOCK_TOUCHED, FIXED_POINT_ONE
+from streamfeat.kernels.layout import CLOCK_PLANE, CLOCK_TOUCHED
 from streamfeat.recording import open_recording
+from streamfeat.state import read_features
 
 EXAMPLES = 25
 ids = "-".join
 
-MEANINGFUL = ("counts", "applied", "is_touched", "projections", "moments", "atoms", "is_dirty", "pooled")
-"""Fields of a state that outlive a call; stacks and scratch are the rest."""
+MEANINGFUL = ("counts", "applied", "is_touched", "is_dirty")
+PLANES = ("projections", "moments", "atoms", "pooled", "cursors")
+"""Fields of a state that outlive a call, of the ring and of its planes; stacks and scratch are the rest."""
+
+
+def assert_same_state(mine, yours):
+    """Both engines' rings, and their planes from the current one on, once the next bin is prepared."""
+    for engine in (mine, yours):
+        engine.features()
+        while not engine.prepare(100):
+            pass
+    for name in MEANINGFUL + PLANES:
+        fields = [getattr(engine._state, name) for engine in (mine, yours)]
+        if name in PLANES:
+            planes = [engine._state.clock[CLOCK_PLANE] for engine in (mine, yours)]
+            fields = [np.roll(field, -plane, axis=0) for field, plane in zip(fields, planes, strict=True)]
+        np.testing.assert_array_equal(*fields, err_msg=name)
 
 
 def now_us(events, case):
@@ -42,7 +60,7 @@ def now_us(events, case):
     return int(events["t"][good].max()) if good.any() else None
 
 
-def lasso_bound(encoder, volumes):
+def lasso_bound(encoder, volumes, unit):
     """How far features of two solutions within the relative gap g may be apart, in any one entry.
 
     The objective `1/2 |x - D l|^2 + lambda |l|_1` is 1-strongly convex in `D l`, so a code within the gap has
@@ -56,7 +74,7 @@ def lasso_bound(encoder, volumes):
     for v in volumes.reshape(-1, volumes.shape[-1]):
         if v.any():
             x = whitening @ ((v - v.mean()) / np.sqrt(v.var() + encoder.operator.eps) - mean)
-            bound += 2 * np.sqrt(encoder.operator.gap / smallest) * np.linalg.norm(x) + 2 / FIXED_POINT_ONE
+            bound += 2 * np.sqrt(encoder.operator.gap / smallest) * np.linalg.norm(x) + 2 / unit
     return 1.01 * bound
 
 
@@ -66,14 +84,16 @@ def assert_agree(case, engine, features, counts, how):
         np.testing.assert_array_equal(engine.features(), features, err_msg=how, strict=True)
         return
     mine = engine.features()
-    assert_certified(case.encoder.operator, engine._state)
-    codes = np.trunc(engine.snapshot().atoms.astype(np.float64) * FIXED_POINT_ONE) / FIXED_POINT_ONE
+    operator, unit = engine._operator, engine._operator.unit
+    assert_certified(operator, engine._state)
+    assert_pooled(engine.grid_shape, operator, engine._state)
+    codes = np.trunc(engine.snapshot().atoms.astype(np.float64) * unit) / unit
     np.testing.assert_array_equal(engine.codes().reshape(codes.shape), codes.astype(np.float32))
     expected = naive.features_from(codes.reshape(*engine.grid_shape, -1), case.encoding)
     np.testing.assert_array_equal(mine, expected.astype(np.float32), err_msg=how)
     gram = case.encoder.operator.gram.astype(np.float64)
     if np.linalg.eigvalsh(gram).min() > 1e-3:
-        bound = lasso_bound(case.encoder, naive.local_volumes(counts, case.geometry))
+        bound = lasso_bound(case.encoder, naive.local_volumes(counts, case.geometry), unit)
         np.testing.assert_allclose(mine, features, rtol=1e-6, atol=bound, err_msg=how)
 
 
@@ -84,7 +104,8 @@ def assert_every_way_agrees(case, events, origin_us, seed):
     offline = case.encoder.encode(events, case.resolution, origin_us=origin_us, t_us=end)
     counts = naive.window_counts(events, case.geometry, case.resolution, origin_us, end)
     tallies = set()
-    for how, engine in fed_in_every_way(lambda: case.engine(origin_us), events, np.random.default_rng(seed)):
+    make_engine = lambda **options: case.engine(origin_us, **options)  # noqa: E731
+    for how, engine in fed_in_every_way(make_engine, events, np.random.default_rng(seed)):
         assert_agree(case, engine, offline, counts, how)
         stats = engine.stats()
         tallies.add((stats.events, stats.late, stats.rejected, stats.saturated, stats.rolls))
@@ -118,6 +139,49 @@ def test_features_of_independent_atoms_agree_within_the_bound_of_the_gap(kind):
         assert_every_way_agrees(case, events, 0, seed)
 
 
+def twin_of(engine):
+    twin = copy.copy(engine)
+    twin._state = copied(engine._state)
+    return twin
+
+
+@pytest.mark.parametrize("look_ahead", [False, True])
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+@settings(max_examples=EXAMPLES)
+@given(data=st.data())
+def test_features_are_those_of_the_window_after_every_batch(kind, look_ahead, data):
+    case = data.draw(cases(kind))
+    events = data.draw(streams(case, 30))
+    origin_us = data.draw(st.integers(-5000, 5000))
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    engine = case.engine(origin_us, look_ahead=look_ahead)
+    for n, told in mixed_steps(engine, events, rng):
+        end = origin_us if told is None else told
+        offline = case.encoder.encode(events[:n], case.resolution, origin_us=origin_us, t_us=end)
+        counts = naive.window_counts(events[:n], case.geometry, case.resolution, origin_us, end)
+        # A copy is read: reading the engine itself would spare it all that piles up between readings.
+        assert_agree(case, twin_of(engine), offline, counts, f"after {n} events")
+
+
+@pytest.mark.parametrize("look_ahead", [False, True])
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+@settings(max_examples=EXAMPLES)
+@given(data=st.data())
+def test_following_leaves_nothing_to_do_for_a_reading(kind, look_ahead, data):
+    case = data.draw(cases(kind))
+    events = data.draw(streams(case, 20))
+    engine = case.engine(look_ahead=look_ahead)
+    for i in range(len(events)):
+        engine.follow(events[i : i + 1])
+        followed, encoded = read_features(engine._operator, engine._state), engine.stats().encoded_volumes
+        end = now_us(events[: i + 1], case) or 0
+        offline = case.encoder.encode(events[: i + 1], case.resolution, origin_us=0, t_us=end)
+        counts = naive.window_counts(events[: i + 1], case.geometry, case.resolution, 0, end)
+        assert_agree(case, engine, offline, counts, f"after {i + 1} events")
+        np.testing.assert_array_equal(engine.features(), followed, strict=True)
+        assert engine.stats().encoded_volumes == encoded
+
+
 def batches_of(recording, n_events):
     kept, total = [], 0
     for batch in recording:
@@ -131,19 +195,22 @@ def batches_of(recording, n_events):
 def assert_real_events_agree(kind, events, resolution, geometry, n_batches=20):
     encoder = random_encoder(np.random.default_rng(1), geometry, 16, *kind)
     origin = int(events["t"][0])
-    whole, split = (Engine(encoder, resolution, origin_us=origin) for _ in range(2))
+    whole, split = (
+        Engine(encoder, resolution, origin_us=origin, look_ahead=ahead) for ahead in (False, True)
+    )
     whole.feed(events)
     for i, batch in enumerate(np.array_split(events, n_batches)):
-        split.feed(batch)
+        (split.follow if i % 3 == 0 and len(batch) < 3000 else split.feed)(batch)
+        split.prepare(2000)
         seen = events[: sum(map(len, np.array_split(events, n_batches)[: i + 1]))]
         features = split.features()
         if encoder.operator.inverse:
-            assert_certified(encoder.operator, split._state)
+            assert_certified(split._operator, split._state)
         elif i % 5 == 0:
             np.testing.assert_array_equal(features, encoder.encode(seen, resolution, origin_us=origin))
     if encoder.operator.inverse:
         whole.features()
-        assert_certified(encoder.operator, whole._state)
+        assert_certified(whole._operator, whole._state)
     else:
         np.testing.assert_array_equal(split.features(), whole.features())
     assert whole.features().any()
@@ -228,19 +295,25 @@ def test_late_events_are_counted_and_change_nothing(kind, n_bins):
 @given(data=st.data())
 def test_after_silence_the_state_is_the_empty_state(kind, data):
     case = data.draw(cases(kind))
-    engine, fresh = case.engine(), case.engine()
+    look_ahead = data.draw(st.booleans())
+    engine, fresh = (case.engine(look_ahead=look_ahead) for _ in range(2))
     events = data.draw(streams(case))
-    engine.feed(events)
+    for _ in mixed_steps(engine, events, np.random.default_rng(data.draw(st.integers(0, 99)))):
+        pass
     if data.draw(st.booleans()):
         engine.features()
         engine.feed(events)
     end = now_us(events, case)
-    silence = 0 if end is None else (end // case.geometry.bin_us + case.geometry.n_bins)
-    engine.advance(silence * case.geometry.bin_us)
+    last = 0 if end is None else end // case.geometry.bin_us
+    if data.draw(st.booleans()):  # bins pass one by one, partly prepared
+        for i in range(1, case.geometry.n_bins):
+            engine.prepare(data.draw(st.sampled_from([1, 100, 10**6])))
+            engine.advance((last + i) * case.geometry.bin_us)
+    engine.advance((last + case.geometry.n_bins) * case.geometry.bin_us)
     assert not engine.snapshot().counts.any()
     np.testing.assert_array_equal(engine.features(), fresh.features(), strict=True)
-    for name in MEANINGFUL:
-        np.testing.assert_array_equal(getattr(engine._state, name), getattr(fresh._state, name), err_msg=name)
+    assert_same_state(engine, fresh)
+    assert not any(getattr(engine._state, name).any() for name in MEANINGFUL + PLANES[:-1])
     assert engine._state.clock[CLOCK_TOUCHED] == 0
     assert engine.stats().active_volumes == 0
 
@@ -256,27 +329,26 @@ def test_one_bin_before_the_silence_is_over_the_last_event_still_counts(kind):
     assert not engine.features().any()
 
 
+@pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("kind", KINDS, ids=ids)
-def test_a_long_run_has_no_drift(kind):
+def test_a_long_run_has_no_drift(kind, look_ahead):
     case = known_case(kind, n_filters=12, threshold=0.3)
     rng = np.random.default_rng(9)
     n_windows, window = 300, case.geometry.window_us
     events = random_events(rng, case.geometry, case.resolution, 20 * n_windows, n_windows)
-    engine = case.engine()
-    for batch in np.array_split(events, 300):
-        engine.feed(batch)
+    engine = case.engine(look_ahead=look_ahead)
+    for i, batch in enumerate(np.array_split(events, 300)):
+        (engine.feed if i % 2 else engine.follow)(batch)
         engine.features()
     assert engine.stats().rolls >= (n_windows - 2) * case.geometry.n_bins
     end = now_us(events, case)
-    fresh = case.engine()
+    fresh = case.engine(look_ahead=look_ahead)
     fresh.feed(events[events["t"] > end - window])
     counts = naive.window_counts(events, case.geometry, case.resolution, 0, end)
     assert_agree(case, engine, fresh.features(), counts, "long run")
     assert engine.features().any()
     if not case.encoder.operator.inverse:
-        for name in MEANINGFUL:
-            mine, theirs = getattr(engine._state, name), getattr(fresh._state, name)
-            np.testing.assert_array_equal(mine, theirs, err_msg=name)
+        assert_same_state(engine, fresh)
 
 
 # The mathematics, in float64 and without any quantisation
@@ -298,12 +370,12 @@ def test_closed_form_codes_are_as_near_as_quantisation_allows(kind, data):
     """An operator entry is off by half a step at most, so `z` by half a step times `|v|_1 / sigma`."""
     case = data.draw(cases(kind))
     engine, exact, volumes = window_codes(case, data.draw(streams(case)))
-    operator = case.encoder.operator
+    operator = engine._operator
     sigma = np.sqrt(volumes.var(axis=2) + operator.eps)
     step = operator.scale / 2 * np.abs(volumes).sum(axis=2) / sigma
-    largest = np.abs(exact).max() + case.threshold + np.abs(operator.offset).max() / FIXED_POINT_ONE
+    largest = np.abs(exact).max() + case.threshold + np.abs(operator.offset).max() / operator.unit
     # Three float32 operations, and a fixed point that is cut off.
-    bound = 1.001 * step + 4 * 2.0**-24 * largest + 1 / FIXED_POINT_ONE
+    bound = 1.001 * step + 4 * 2.0**-24 * largest + 1 / operator.unit
     assert (np.abs(engine.codes() - exact).max(axis=2) <= bound).all()
 
 
@@ -318,7 +390,7 @@ def test_codes_of_real_events_are_right_to_a_ten_thousandth(kind, digits):
         codes = naive.codes_of(naive.window_counts(events, geometry, (34, 34), 0, end), encoder)
         largest = np.abs(codes).max()
         assert largest > 0.1
-        assert np.abs(engine.codes() - codes).max() <= 1e-4 * largest + 1 / FIXED_POINT_ONE
+        assert np.abs(engine.codes() - codes).max() <= 1e-4 * largest + 1 / engine._operator.unit
         features = naive.features_from(codes, encoder.encoding)
         offline = encoder.encode(events, (34, 34), origin_us=0)
         np.testing.assert_allclose(offline, features, atol=1e-4 * largest * len(codes) ** 2)

@@ -302,6 +302,36 @@ def test_time_that_goes_back_is_late_and_nothing_else():
         assert times(emissions) == sorted(times(emissions))
 
 
+def test_events_from_before_an_open_sample_do_not_count_for_it():
+    """As offline: a sample holds the events from its start on, whatever is in the packets that follow."""
+    start = 10 * WINDOW + 7
+    inside = tiny.steady(start, start + 1000, 40)
+    inside["t"][0] = start
+    early = tiny.steady(start - WINDOW // 2, start, 20, seed=3)  # inside the window, had they counted
+    early["t"][0] = start - 1
+    bad = make_events([999], [0], [1], [start - 5])
+    after = tiny.steady(start + WINDOW, start + WINDOW + 10, 5, seed=4)
+    rng = np.random.default_rng(0)
+    mixed = np.concatenate([early[:10], inside[:20], early[10:], bad, inside[20:]])
+    label = Label(start, WINDOW, "cat")
+    for policy in POLICIES:
+        expected, _ = run([label, tiny.packet(inside), tiny.packet(after)], policy)
+        items = [label, tiny.packet(np.concatenate([mixed, after]))]
+        for given in (items, list(cut(items, rng))):
+            emissions, session = run(given, policy)
+            stats = session.stats()
+            assert (stats.events, stats.late, stats.rejected) == (45, 20, 1)
+            final, wanted = ([e for e in es if e.final] for es in (emissions, expected))
+            assert np.array_equal(final[0].features, wanted[0].features)
+            offline = MODEL.encode(inside, tiny.RESOLUTION, origin_us=start, t_us=start + WINDOW - 1)
+            assert np.array_equal(final[0].features, offline)
+    # Once the sample is over, they count again as far as the window goes back.
+    _, session = run([label, tiny.packet(inside), tiny.packet(after), tiny.packet(early)])
+    assert session.stats().late == 20 - np.count_nonzero(early["t"] >= start)
+    _, session = run([tiny.packet(inside), tiny.packet(early)])
+    assert session.stats().late == 0
+
+
 # --- classifiers
 
 

@@ -1,6 +1,7 @@
 """Draw the README's picture: the terminal during a replay of the recording that comes with the project.
 
-Lives here: running the replay and saving what it printed as SVG. Not here: what is printed (`streamfeat.sinks`).
+Lives here: running the replay and saving what it printed as SVG.
+Not here: what is printed (`streamfeat.sinks`).
 
     python tools/make_picture.py
 """

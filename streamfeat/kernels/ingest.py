@@ -7,7 +7,6 @@ Every event is checked before it indexes anything: a batch from a hostile source
 as rejected. The check is inside the loop because it costs less there than a vectorised pass before it.
 """
 
-import numpy as np
 from numba import njit
 
 from streamfeat.events import Events
@@ -15,6 +14,8 @@ from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
+    CLOCK_PLANE,
+    CLOCK_START,
     CLOCK_TOUCHED,
     TALLY_EVENTS,
     TALLY_LATE,
@@ -25,61 +26,96 @@ from streamfeat.kernels.layout import (
     State,
 )
 
+UNCHANGED = -1
+"""Instead of a place: no clipped count changed."""
+
 
 @njit(cache=True, nogil=True)
-def advance_to_bin(new: int, state: State) -> None:
-    """Make `new` the current bin: the slots of bins that leave the window are cleared for reuse."""
+def advance_to_bin(new: int, operator: Operator, state: State) -> None:
+    """Make `new` the current bin: the slots of bins that leave the window are cleared for reuse.
+
+    To the next bin, the planes swap: the one that looked ahead is current, and the other starts anew. Any
+    further, and both start anew.
+    """
     clock, counts = state.clock, state.counts
-    n_bins = counts.shape[0]
+    n_bins, n_planes = counts.shape[0], state.cursors.shape[0]
     now = clock[CLOCK_NOW]
     if new <= now:
         return
     for b in range(max(now + 1, new - n_bins + 1), new + 1):
         counts[b % n_bins] = 0
+        state.applied[b % n_bins] = 0
     if now > BEFORE_TIME:
         state.tally[TALLY_ROLLS] += new - now
     clock[CLOCK_NOW] = new
+    clock[CLOCK_START] = clock[CLOCK_ORIGIN] + new * operator.bin_us
+    next_plane = (clock[CLOCK_PLANE] + 1) % n_planes
+    for plane in range(n_planes):
+        if new != now + 1 or n_planes == 1 or plane != next_plane:
+            state.cursors[plane] = 0
+            state.pooled[plane] = 0
+    clock[CLOCK_PLANE] = next_plane
+
+
+@njit(cache=True, nogil=True)
+def count_event(
+    x: int, y: int, p: int, t: int, height: int, width: int, operator: Operator, state: State
+) -> int:
+    """Count one event in its pixel and bin.
+
+    Args:
+        x: column in pixels, any value.
+        y: row in pixels, any value.
+        p: polarity, any value.
+        t: stream time in microseconds, any value.
+        height: rows of the sensor, pixels.
+        width: columns of the sensor, pixels.
+        operator: geometry is read from it.
+        state: `counts`, `clock` and `tally` are changed, and the planes where a bin begins.
+
+    Returns:
+        the flat index of the entry whose clipped count changed by `2 p - 1`, or UNCHANGED.
+    """
+    counts, clock, tally = state.counts, state.clock, state.tally
+    n_bins, limit = counts.shape[0], operator.max_count
+    if x >= width or y >= height or p < 0 or p > 1 or t <= BEFORE_TIME or t >= -BEFORE_TIME:
+        tally[TALLY_REJECTED] += 1
+        return UNCHANGED
+    bin_index = clock[CLOCK_NOW]
+    # Most events fall into the current bin: a division for each would cost as much as all the rest.
+    if bin_index == BEFORE_TIME or t < clock[CLOCK_START] or t - clock[CLOCK_START] >= operator.bin_us:
+        bin_index = (t - clock[CLOCK_ORIGIN]) // operator.bin_us
+        advance_to_bin(bin_index, operator, state)
+        if bin_index <= clock[CLOCK_NOW] - n_bins:
+            tally[TALLY_LATE] += 1
+            return UNCHANGED
+    tally[TALLY_EVENTS] += 1
+    slot, row, column = bin_index % n_bins, y // operator.downsample, x // operator.downsample
+    before = counts[slot, row, column]
+    after = before + 2 * p - 1
+    counts[slot, row, column] = after
+    if min(max(before, -limit), limit) == min(max(after, -limit), limit):
+        tally[TALLY_SATURATED] += 1
+        return UNCHANGED
+    return (slot * counts.shape[1] + row) * counts.shape[2] + column
 
 
 @njit(cache=True, nogil=True)
 def count_events(events: Events, height: int, width: int, operator: Operator, state: State) -> None:
-    """Count every event of a batch in its pixel and bin, and note the entries that changed.
+    """Count every event of a batch, and note the entries that changed for the next reading.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
         height: rows of the sensor, pixels.
         width: columns of the sensor, pixels.
         operator: geometry is read from it.
-        state: `counts`, `touched`, `is_touched`, `clock` and `tally` are changed.
+        state: as for `count_event`; `touched` and `is_touched` are changed too.
     """
-    counts, clock, tally = state.counts, state.clock, state.tally
-    n_bins = counts.shape[0]
-    limit = operator.max_count
-    origin = clock[CLOCK_ORIGIN]
-    bin_start, bin_index = np.int64(0), np.int64(BEFORE_TIME)
+    flags = state.is_touched.reshape(-1)
     for i in range(events.shape[0]):
         event = events[i]
-        x, y, p, t = event.x, event.y, event.p, event.t
-        if x >= width or y >= height or p < 0 or p > 1 or t <= BEFORE_TIME or t >= -BEFORE_TIME:
-            tally[TALLY_REJECTED] += 1
-            continue
-        # Neighbours in a stream share their bin: a division for each event would cost as much as the rest.
-        if bin_index == BEFORE_TIME or t < bin_start or t - bin_start >= operator.bin_us:
-            bin_index = (t - origin) // operator.bin_us
-            bin_start = bin_index * operator.bin_us + origin
-            if bin_index > clock[CLOCK_NOW]:
-                advance_to_bin(bin_index, state)
-        if bin_index <= clock[CLOCK_NOW] - n_bins:
-            tally[TALLY_LATE] += 1
-            continue
-        tally[TALLY_EVENTS] += 1
-        slot, row, column = bin_index % n_bins, y // operator.downsample, x // operator.downsample
-        before = counts[slot, row, column]
-        after = before + 2 * p - 1
-        counts[slot, row, column] = after
-        if min(max(before, -limit), limit) == min(max(after, -limit), limit):
-            tally[TALLY_SATURATED] += 1
-        elif state.is_touched[slot, row, column] == 0:
-            state.is_touched[slot, row, column] = 1
-            state.touched[clock[CLOCK_TOUCHED]] = (slot * counts.shape[1] + row) * counts.shape[2] + column
-            clock[CLOCK_TOUCHED] += 1
+        place = count_event(event.x, event.y, event.p, event.t, height, width, operator, state)
+        if place != UNCHANGED and flags[place] == 0:
+            flags[place] = 1
+            state.touched[state.clock[CLOCK_TOUCHED]] = place
+            state.clock[CLOCK_TOUCHED] += 1

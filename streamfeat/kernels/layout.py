@@ -1,6 +1,6 @@
 """What the kernels are given: the frozen operator and the changing state, as tuples of arrays.
 
-Lives here: the two tuples, the meaning of their slots, and the fixed point that codes are pooled in.
+Lives here: the two tuples and the meaning of their slots.
 Not here: how they are filled (`encoder`, `engine`) or what is done with them (the other kernels).
 """
 
@@ -9,15 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FIXED_POINT_BITS = 16
-FIXED_POINT_ONE = 1 << FIXED_POINT_BITS
-"""Codes are pooled as integer multiples of `1 / FIXED_POINT_ONE`, so a sum has no order."""
-
 SOFT, SPLIT, TRIANGLE = 0, 1, 2
 ENCODINGS = {"soft": SOFT, "split": SPLIT, "triangle": TRIANGLE}
-
-LARGEST_SQUARE = 1 << 26
-"""`|x|^2` and the squared length of a filter stay below this, so that a distance fits the fixed point."""
 
 LANES = 32
 """Filters are padded with zeros to a multiple of this, so that no vector loop has a tail."""
@@ -39,6 +32,8 @@ class Operator(NamedTuple):
     """One of SOFT, SPLIT, TRIANGLE."""
     inverse: bool
     """Codes come from the lasso (never for TRIANGLE, which reads distances)."""
+    unit: float
+    """A code of one in the fixed point that codes are pooled in, a power of two; sums have no order."""
     columns: NDArray[np.int16]
     """`(d, Kp)`: row `i` is what one count at entry `i` adds to the projection of a volume."""
     scale: float
@@ -46,9 +41,9 @@ class Operator(NamedTuple):
     eps: float
     """Added to the variance of a volume before the square root."""
     offset: NDArray[np.float32]
-    """`(Kp,)`: `P mu`, times FIXED_POINT_ONE."""
+    """`(Kp,)`: `P mu`, times `unit`."""
     threshold: float
-    """The sparsity penalty lambda0 (float32), times FIXED_POINT_ONE."""
+    """The sparsity penalty lambda0 (float32), times `unit`."""
     quadratic: NDArray[np.int32]
     """`(d, d)`: `v' quadratic v * quadratic_scale / sigma^2` is the part of `|x|^2` quadratic in `v`."""
     quadratic_scale: float
@@ -57,6 +52,10 @@ class Operator(NamedTuple):
     linear_scale: float
     constant: float
     """`|W mu|^2`, the rest of `|x|^2`."""
+    reach: float
+    """An upper bound of `|x|`."""
+    largest: float
+    """What no entry of a code, nor any number on the way to it, exceeds in absolute value."""
     square_norms: NDArray[np.float32]
     """`(Kp,)`: squared length of each filter."""
     gram: NDArray[np.float32]
@@ -66,32 +65,41 @@ class Operator(NamedTuple):
 
 
 class State(NamedTuple):
-    """Everything that events change. `R, C` rows and columns of volumes, `V = R * C`, `T` bins."""
+    """Everything that events change. `V` volumes, `T` bins, and one or two planes.
+
+    A plane is the state of all volumes at one bin: projections, moments, lasso codes, pooled sums. The
+    plane of the current bin is what is read. A second plane, if there is one, looks ahead: it holds what
+    volumes will be after the next bin boundary, so that the boundary only swaps the two. Volumes enter a
+    plane in order, and those below its cursor are in it. Invariant: a row whose sum of squares is zero
+    has moments and projection zero.
+    """
 
     counts: NDArray[np.int32]
     """`(T, H, W)`: signed counts, one slot a bin; bin `b` lives in slot `b % T`."""
     applied: NDArray[np.int16]
-    """`(T, H, W)`: the clipped counts that projections stand for."""
+    """`(T, H, W)`: the clipped counts that planes stand for."""
     touched: NDArray[np.int32]
     """`(T * H * W,)`: flat indices of the entries whose clipped count changed since; a stack."""
     is_touched: NDArray[np.uint8]
     """`(T, H, W)`: whether an entry is on that stack."""
     clock: NDArray[np.int64]
-    """`(4,)`: see the CLOCK_* slots."""
+    """`(5,)`: see the CLOCK_* slots."""
+    cursors: NDArray[np.int64]
+    """`(planes,)`: volumes below it have entered the plane."""
     tally: NDArray[np.int64]
-    """`(5,)`: see the TALLY_* slots."""
+    """`(6,)`: see the TALLY_* slots."""
     projections: NDArray[np.int32]
-    """`(V, Kp)`: `q` of every volume."""
+    """`(planes, V, Kp)`: `q` of every volume."""
     moments: NDArray[np.int64]
-    """`(V, 4)`: sum of entries, sum of squares, quadratic form, linear form, of every volume."""
+    """`(planes, V, 4)`: sum of entries, sum of squares, quadratic form, linear form, of every volume."""
     atoms: NDArray[np.float32]
-    """`(V, K)`: the last lasso code of every volume, from which the next is started."""
+    """`(planes, V, K)`: the last lasso code of every volume, from which the next is started."""
+    pooled: NDArray[np.int32]
+    """`(planes, 4, F)`: fixed-point codes summed over each quadrant; `F` is Kp, or 2 Kp for SPLIT."""
     dirty: NDArray[np.int32]
-    """`(V,)`: volumes to encode again; a stack."""
+    """`(planes * V,)`: volumes to encode again, by `plane * V + volume`; a stack."""
     is_dirty: NDArray[np.uint8]
-    """`(V,)`: whether a volume is on that stack."""
-    pooled: NDArray[np.int64]
-    """`(4, F)`: codes summed over each quadrant, in fixed point; `F` is Kp, or 2 Kp for SPLIT."""
+    """`(planes * V,)`: whether a volume is on that stack."""
     code: NDArray[np.int32]
     """`(Kp,)`: scratch, the fixed-point code of one volume."""
     work: NDArray[np.float64]
@@ -102,11 +110,12 @@ class State(NamedTuple):
     """`(d,)`: scratch, the entries of one volume."""
 
 
-CLOCK_NOW, CLOCK_PROJECTED, CLOCK_TOUCHED, CLOCK_ORIGIN = range(4)
-"""Current bin; the bin that projections stand for; height of the touched stack; time of bin 0 in us."""
+CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE = range(5)
+"""Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane."""
 
-TALLY_EVENTS, TALLY_LATE, TALLY_REJECTED, TALLY_SATURATED, TALLY_ROLLS = range(5)
-"""Accepted; older than the window; outside the sensor or malformed; no change of a clipped count; bins."""
+TALLY_EVENTS, TALLY_LATE, TALLY_REJECTED, TALLY_SATURATED, TALLY_ROLLS, TALLY_ENCODED = range(6)
+"""Accepted; older than the window; outside the sensor or malformed; no change of a clipped count; bins
+moved on by; volumes encoded."""
 
 MOMENT_SUM, MOMENT_SQUARES, MOMENT_QUADRATIC, MOMENT_LINEAR = range(4)
 

@@ -25,6 +25,13 @@ def add_column(change: int, column: NDArray[np.int16], projection: NDArray[np.in
 
 
 @njit(cache=True, nogil=True)
+def change_moments(before: int, after: int, moments: NDArray[np.int64]) -> None:
+    """Let one entry of a volume change in the sum and in the sum of squares."""
+    moments[MOMENT_SUM] += after - before
+    moments[MOMENT_SQUARES] += after * after - before * before
+
+
+@njit(cache=True, nogil=True)
 def change_entry(
     entry: int,
     before: int,
@@ -48,8 +55,7 @@ def change_entry(
     """
     change = np.int32(after - before)
     add_column(change, operator.columns[entry], projection)
-    moments[MOMENT_SUM] += change
-    moments[MOMENT_SQUARES] += after * after - before * before
+    change_moments(before, after, moments)
     if operator.quadratic.shape[0]:
         form = operator.quadratic[entry]
         product = np.int64(0)
@@ -61,13 +67,20 @@ def change_entry(
 
 @njit(cache=True, nogil=True)
 def gather_volume(
-    ring: NDArray[np.int16], first_slot: int, top: int, left: int, patch: int, values: NDArray[np.int16]
+    ring: NDArray[np.int16],
+    first_slot: int,
+    filled_bins: int,
+    top: int,
+    left: int,
+    patch: int,
+    values: NDArray[np.int16],
 ) -> int:
     """Copy the entries of a volume out of a ring of clipped counts, oldest bin first.
 
     Args:
         ring: `(T, H, W)` clipped counts.
         first_slot: slot of the oldest bin.
+        filled_bins: bins to copy; those after them, which have not begun, are zero.
         top: first row of the volume.
         left: first column of the volume.
         patch: rows and columns of the volume.
@@ -78,7 +91,8 @@ def gather_volume(
     """
     n_bins = ring.shape[0]
     filled, i = 0, 0
-    for position in range(n_bins):
+    values[filled_bins * patch * patch :] = 0
+    for position in range(filled_bins):
         plane = ring[(first_slot + position) % n_bins]
         for row in range(top, top + patch):
             for column in range(left, left + patch):
