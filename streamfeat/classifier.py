@@ -37,9 +37,10 @@ def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
     Returns:
         same shape; all zero where the features are.
     """
-    rooted = np.sign(features) * np.sqrt(np.abs(features))
-    length = np.sqrt(np.square(rooted).sum(axis=-1, keepdims=True))
-    return np.asarray(rooted / np.where(length > 0, length, 1), np.float32)
+    size = np.abs(features)
+    # The squares of the roots add up to the sizes.
+    length = np.sqrt(size.sum(axis=-1, keepdims=True))
+    return np.asarray(np.copysign(np.sqrt(size), features) / np.where(length > 0, length, 1), np.float32)
 
 
 @dataclass(frozen=True, slots=True)

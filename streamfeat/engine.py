@@ -26,6 +26,7 @@ from streamfeat.kernels.layout import (
     CLOCK_PLANE,
     CLOCK_START,
     MOMENT_SQUARES,
+    TALLY_EVENTS,
 )
 from streamfeat.kernels.planes import look_ahead
 from streamfeat.kernels.update import update
@@ -192,6 +193,11 @@ class Engine:
             encode_volume(projection, moments, atoms, False, operator, state)
             code[:] = state.code[: operator.n_filters] / operator.unit
         return codes.reshape(*self.grid_shape, operator.n_filters)
+
+    @property
+    def n_events(self) -> int:
+        """Events accepted and counted, as in `stats()`."""
+        return int(self._state.tally[TALLY_EVENTS])
 
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""

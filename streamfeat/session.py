@@ -231,7 +231,7 @@ class Session:
         classifier = self.classifier
         return Emission(
             t_us=t_us,
-            n_events=self._stats.events + engine.stats().events,
+            n_events=self._stats.events + engine.n_events,
             features=features,
             labels=classifier.labels if classifier else (),
             scores=classifier.scores(features) if classifier else _NO_SCORES,
