@@ -25,6 +25,7 @@ from streamfeat.kernels.layout import (
     CLOCK_ORIGIN,
     CLOCK_PLANE,
     CLOCK_START,
+    CLOCK_TOUCHED,
     MOMENT_SQUARES,
     TALLY_EVENTS,
 )
@@ -134,7 +135,7 @@ class Engine:
             InputError: not an array of EVENT_DTYPE.
         """
         events = self._checked(batch)
-        update(self.grid_shape, self._operator, self._state)
+        self._update()
         follow(events, *self.resolution, self.grid_shape, self._operator, self._state)
 
     def prepare(self, columns: int) -> bool:
@@ -146,10 +147,17 @@ class Engine:
         Returns:
             whether nothing is left to prepare.
         """
-        update(self.grid_shape, self._operator, self._state)
+        self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
         left = look_ahead(volumes, columns, self.grid_shape, self._operator, self._state)
         return bool(left > 0)
+
+    def _update(self) -> None:
+        """Bring the current plane up to date; asks first, for a call of a kernel costs 15 us by itself."""
+        clock, cursors = self._state.clock, self._state.cursors
+        complete = cursors[clock[CLOCK_PLANE]] == self._state.moments.shape[1]
+        if clock[CLOCK_TOUCHED] or not complete:
+            update(self.grid_shape, self._operator, self._state)
 
     @staticmethod
     def _checked(batch: Events) -> Events:
@@ -169,7 +177,9 @@ class Engine:
             InputError: the time is beyond 2^62 microseconds.
         """
         since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
-        advance_to_bin(since // self._operator.bin_us, self._operator, self._state)
+        new = since // self._operator.bin_us
+        if new > self._state.clock[CLOCK_NOW]:
+            advance_to_bin(new, self._operator, self._state)
 
     @staticmethod
     def _checked_time(t_us: int) -> int:
@@ -179,12 +189,12 @@ class Engine:
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        update(self.grid_shape, self._operator, self._state)
+        self._update()
         return read_features(self._operator, self._state)
 
     def codes(self) -> NDArray[np.float32]:
         """The code of every local volume, a copy: `(rows, columns, K)` float32, before any split."""
-        update(self.grid_shape, self._operator, self._state)
+        self._update()
         state, operator = self._state, self._operator
         plane = state.clock[CLOCK_PLANE]
         rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
@@ -224,7 +234,7 @@ class Engine:
 
     def snapshot(self) -> Snapshot:
         """Copy the state. Projections and codes are not part of it: they follow from the counts."""
-        update(self.grid_shape, self._operator, self._state)
+        self._update()
         state = self._state
         return Snapshot(
             fingerprint=self.encoder.fingerprint,
