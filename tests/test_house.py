@@ -33,6 +33,7 @@ LAYERS = [
 ROOMS = {
     "learn": [{"initial", "volumes", "whitening"}, {"dictionary", "transform"}, {"fit"}],
     "foreign": [{"words"}, {"tables"}, {"containers"}, {"event_files"}, {"datasets"}],
+    "cli": [{"program"}, {"learning", "recordings", "streaming"}],
 }
 """The same inside packages that are one place in the layers."""
 
@@ -40,7 +41,7 @@ ONLY_IN = {
     "asyncio": {"pipeline", "replay"},
     "mcap": {"mcap_records", "recording", "recorder"},
     "zenoh": {"live"},
-    "typer": {"cli"},
+    "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.streaming"},
     "numba": {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"}
     | {"kernels.encode", "kernels.planes", "kernels.update", "kernels.follow"},
 }

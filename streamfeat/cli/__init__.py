@@ -1,0 +1,30 @@
+"""The command line: arguments and wiring.
+
+Lives here: the entry point, and which modules hold commands.
+Not here: anything another program might want to call. Commands import what they use when they run, so that
+`--help` does not wait for it.
+"""
+
+import sys
+from typing import NoReturn
+
+from rich.markup import escape
+
+from streamfeat.cli import learning, recordings, streaming
+from streamfeat.cli.program import app, err
+from streamfeat.errors import InputError
+
+__all__ = ["app", "learning", "main", "recordings", "streaming"]
+
+
+def main() -> NoReturn:
+    """Run the command line; what the user can mend ends with one line and exit status 2."""
+    try:
+        app()
+    except InputError as error:
+        err.print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}", soft_wrap=True)
+        sys.exit(2)
+    except MemoryError as error:
+        err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
+        sys.exit(2)
+    sys.exit(0)

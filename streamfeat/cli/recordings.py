@@ -1,0 +1,109 @@
+"""Commands that look at recordings and make them: info, convert.
+
+Lives here: their arguments, and how their results are shown.
+Not here: reading and writing (`recording`, `recorder`, `foreign`).
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from streamfeat.cli.program import (
+    JsonOption,
+    OverwriteOption,
+    RecordingArgument,
+    TopicOption,
+    app,
+    err,
+    print_losses,
+    print_result,
+    progress_bars,
+)
+from streamfeat.errors import InputError
+
+__all__ = ["convert", "info"]
+
+
+@app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
+def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonOption = False) -> None:
+    """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording."""
+    from streamfeat.recording import open_recording
+
+    with open_recording(recording, topic) as rec:
+        height, width = rec.resolution
+        labels = sorted({label.label for label in rec.labels})
+        splits = sorted({label.split for label in rec.labels if label.split})
+        result = {
+            "file": str(recording),
+            "topics": ", ".join(
+                f"{t.name} ({t.schema}, {t.schema_encoding}, {t.n_messages})" for t in rec.topics
+            ),
+            "read": rec.topic,
+            "encoding": rec.encoding,
+            "resolution": f"{width}x{height}",
+            "events": rec.n_events,
+            "on": rec.n_on,
+            "off": rec.n_off,
+            "first_us": rec.first_us,
+            "duration_s": rec.duration_us / 1e6,
+            "events_per_s": round(rec.n_events / max(rec.duration_us / 1e6, 1e-6)),
+            "samples": len(rec.labels),
+            "labels": ", ".join(labels),
+            "splits": ", ".join(splits),
+            "integrity": "damaged" if rec.losses else "intact",
+        }
+        print_result(result, str(recording), as_json=as_json)
+        print_losses(rec.losses)
+
+
+@app.command(epilog="Example: streamfeat convert n-cars_train ncars.mcap --split-every 5")
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Data set folder or camera file.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
+    split_every: Annotated[
+        int | None,
+        typer.Option(help="Every n-th sample is split 'validation', the others 'train'."),
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="Split of all samples, whatever folders say.")] = None,
+    limit: Annotated[int | None, typer.Option(help="Convert only so many, classes in balance.")] = None,
+    gap_ms: Annotated[float, typer.Option(help="Silence between samples; at least one window.")] = 1000.0,
+    encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
+    compression: Annotated[str, typer.Option(help="Chunks: zstd, lz4 or none.")] = "zstd",
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A data set folder or a camera file to MCAP, with labels and splits from the folder layout."""
+    from streamfeat.foreign import datasets
+
+    if not 0 < gap_ms < 1e9:
+        raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
+    with progress_bars() as report:
+        done = datasets.convert(
+            source,
+            target,
+            overwrite=overwrite,
+            gap_us=round(gap_ms * 1000),
+            split=split,
+            split_every=split_every,
+            encoding=encoding,
+            compression=compression,  # type: ignore[arg-type]
+            limit=limit,
+            progress=lambda n, total: report("converting", n, total, ""),
+        )
+    result = {
+        "written": str(target),
+        "samples": done.samples,
+        "events": done.events,
+        "bytes_in": done.bytes_in,
+        "bytes_out": done.bytes_out,
+        "failed": len(done.failed),
+        "damaged": len(done.damaged),
+    }
+    print_result(result, "converted", as_json=as_json)
+    for what, files in (("failed", done.failed), ("damaged", done.damaged)):
+        for path, reason in files[:20]:
+            err.print(f"[yellow]{what}:[/] {escape(f'{path}: {reason}')}", soft_wrap=True)
+    if done.failed or done.damaged:
+        raise typer.Exit(1)

@@ -1,0 +1,85 @@
+"""Commands that run the main job: replay.
+
+Lives here: their arguments, and how their results are shown.
+Not here: the job (`replay`).
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from streamfeat.cli.program import (
+    JsonOption,
+    ModelOption,
+    OverwriteOption,
+    RecordingArgument,
+    TopicOption,
+    app,
+    out,
+    print_losses,
+    print_result,
+    refuse_existing,
+)
+
+__all__ = ["replay"]
+
+
+@app.command(
+    epilog="Example: streamfeat replay recordings/digits_test.mcap -m recordings/digits.safetensors "
+    "-c recordings/digits_classifier.safetensors"
+)
+def replay(
+    recording: RecordingArgument,
+    model: ModelOption,
+    classifier: Annotated[
+        Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
+    ] = None,
+    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "max",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
+    ] = None,
+    json_lines: Annotated[
+        Path | None,
+        typer.Option(help="Write a JSON line for each emission to this file; - is stdout."),
+    ] = None,
+    features: Annotated[bool, typer.Option("--features", help="Include features in JSON lines.")] = False,
+    split: Annotated[str | None, typer.Option(help="Replay only samples of this split.")] = None,
+    learn_online: Annotated[
+        bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
+    ] = False,
+    topic: TopicOption = None,
+    overwrite: OverwriteOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """The main job on a recording: events to features to predictions, scored where there are labels."""
+    from streamfeat.replay import Replay
+
+    for path in (output, json_lines):
+        if path and str(path) != "-":
+            refuse_existing(path, overwrite=overwrite)
+    job = Replay(
+        recording,
+        model,
+        classifier,
+        emit=emit,
+        speed=speed,
+        topic=topic,
+        split=split,
+        learn_online=learn_online,
+    )
+    to_terminal = str(json_lines) == "-"
+    job.run(
+        console=None if quiet or as_json or to_terminal else out,
+        recording_out=output,
+        json_lines=sys.stdout if to_terminal else json_lines,
+        with_features=features,
+    )
+    if not to_terminal:
+        print_result(job.result(), "replayed", as_json=as_json)
+    print_losses(job.losses)
+    if job.interrupted:
+        raise typer.Exit(130)
