@@ -26,6 +26,7 @@ from streamfeat.kernels.layout import (
     CLOCK_PLANE,
     CLOCK_START,
     CLOCK_TOUCHED,
+    CURSOR_CODED,
     MOMENT_SQUARES,
     TALLY_EVENTS,
 )
@@ -68,8 +69,9 @@ class Snapshot:
         fingerprint: of the encoder.
         counts: `(T, H, W)` int32, the ring.
         atoms: `(V, K)` float32, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        clock: `(5,)` int64, of which the current bin and the origin matter.
-        tally: `(6,)` int64, what was counted.
+        clock: `(6,)` int64, of which the current bin and the origin matter.
+        tally: `(5,)` int64, what was counted.
+        encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
     """
 
     fingerprint: str
@@ -77,6 +79,7 @@ class Snapshot:
     atoms: NDArray[np.float32]
     clock: NDArray[np.int64]
     tally: NDArray[np.int64]
+    encoded: NDArray[np.int64]
 
 
 class Engine:
@@ -149,13 +152,13 @@ class Engine:
         """
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
-        left = look_ahead(volumes, columns, self.grid_shape, self._operator, self._state)
+        left = look_ahead(volumes, volumes, columns, self.grid_shape, self._operator, self._state)
         return bool(left > 0)
 
     def _update(self) -> None:
         """Bring the current plane up to date; asks first, for a call of a kernel costs 15 us by itself."""
         clock, cursors = self._state.clock, self._state.cursors
-        complete = cursors[clock[CLOCK_PLANE]] == self._state.moments.shape[1]
+        complete = cursors[clock[CLOCK_PLANE], CURSOR_CODED] == self._state.moments.shape[1]
         if clock[CLOCK_TOUCHED] or not complete:
             update(self.grid_shape, self._operator, self._state)
 
@@ -200,8 +203,8 @@ class Engine:
         rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
         codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
         for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
-            encode_volume(projection, moments, atoms, False, operator, state)
-            code[:] = state.code[: operator.n_filters] / operator.unit
+            encode_volume(projection, moments, atoms, False, 0, operator, state)
+            code[:] = state.code[0, : operator.n_filters] / operator.unit
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
     @property
@@ -211,7 +214,8 @@ class Engine:
 
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
-        events, late, rejected, saturated, rolls, encoded = (int(value) for value in self._state.tally)
+        events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)
+        encoded = int(self._state.encoded.sum())
         plane = self._state.clock[CLOCK_PLANE]
         active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
         return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
@@ -242,6 +246,7 @@ class Engine:
             atoms=state.atoms[state.clock[CLOCK_PLANE]].copy(),
             clock=state.clock.copy(),
             tally=state.tally.copy(),
+            encoded=state.encoded.copy(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -269,3 +274,4 @@ class Engine:
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
         update(self.grid_shape, self._operator, state)
         state.tally[:] = snapshot.tally
+        state.encoded[:] = snapshot.encoded

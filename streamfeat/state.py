@@ -15,6 +15,7 @@ from streamfeat.kernels.layout import (
     CLOCK_ORIGIN,
     CLOCK_PLANE,
     CLOCK_START,
+    PARTS,
     SPLIT,
     Operator,
     State,
@@ -50,7 +51,7 @@ def allocate_state(
     volumes = rows * columns if keep else 1
     padded = operator.offset.shape[0]
     atoms = operator.n_filters if operator.inverse else 0
-    clock = np.zeros(5, np.int64)
+    clock = np.zeros(6, np.int64)
     clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
     clock[CLOCK_ORIGIN] = origin_us
     features = 2 * padded if operator.kind == SPLIT else padded
@@ -59,19 +60,23 @@ def allocate_state(
         applied=np.zeros(ring, np.int16),
         touched=np.zeros(int(np.prod(ring)), np.int32),
         is_touched=np.zeros(ring, np.uint8),
+        touched_slots=np.zeros(geometry.n_bins, np.uint8),
         clock=clock,
-        cursors=np.zeros(planes, np.int64),
-        tally=np.zeros(6, np.int64),
+        cursors=np.zeros((planes, 3), np.int64),
+        tally=np.zeros(5, np.int64),
+        encoded=np.zeros(PARTS, np.int64),
         projections=np.zeros((planes, volumes, padded), np.int32),
         moments=np.zeros((planes, volumes, 4), np.int64),
         atoms=np.zeros((planes, volumes, atoms), np.float32),
         pooled=np.zeros((planes, 4, features), np.int32),
         dirty=np.zeros(planes * volumes, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
-        code=np.zeros(padded, np.int32),
-        work=np.zeros((4, padded), np.float64),
-        active=np.zeros(padded, np.int64),
-        values=np.zeros(geometry.entries, np.int16),
+        code=np.zeros((PARTS, padded), np.int32),
+        work=np.zeros((PARTS, 4, padded), np.float64),
+        active=np.zeros((PARTS, padded), np.int64),
+        values=np.zeros((PARTS, geometry.entries), np.int16),
+        entries=np.zeros((PARTS, geometry.entries), np.int32),
+        changes=np.zeros((PARTS, geometry.entries), np.int16),
     )
 
 
@@ -79,4 +84,7 @@ def read_features(operator: Operator, state: State) -> NDArray[np.float32]:
     """The pooled sums quadrant by quadrant, without padding: `(4 K,)` float32, or `(8 K,)` for `split`."""
     pooled = state.pooled[state.clock[CLOCK_PLANE]]
     parts = pooled.reshape(4, -1, operator.offset.shape[0])[:, :, : operator.n_filters]
+    if operator.kind == SPLIT:
+        signed, absolute = parts[:, 0], parts[:, 1]
+        parts = np.stack([absolute + signed, absolute - signed], axis=1) // 2
     return np.asarray(parts.reshape(-1) / operator.unit, np.float32)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, Operator
+from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, PARTS, Operator
 from streamfeat.kernels.planes import complete
 from streamfeat.operator import with_fixed_point
 from streamfeat.state import allocate_state, read_features
@@ -70,5 +70,6 @@ def encode_window(
     state = allocate_state(geometry, pooling, resolution, keep=False)
     state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
     state.clock[CLOCK_NOW] = -1  # the window ends with the last slot
-    complete(shape, pooling, state)
+    for part in range(PARTS):
+        complete(part, shape, pooling, state)
     return read_features(pooling, state)

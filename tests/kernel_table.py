@@ -19,13 +19,16 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CURSOR_CODED,
+    CURSOR_PROJECTED,
     MOMENT_SQUARES,
+    PARTS,
     SPLIT,
     Operator,
     State,
 )
 
-SCRATCH = {"touched", "dirty", "code", "work", "active", "values"}
+SCRATCH = {"touched", "touched_slots", "dirty", "code", "work", "active", "values", "entries", "changes"}
 """Fields of a State whose content means nothing between two calls."""
 
 
@@ -83,15 +86,26 @@ def exact_but_atoms(kernel: Run, twin: Run) -> None:
     return None
 
 
+def exact_but_atoms_of_a_part(kernel: Run, twin: Run) -> None:
+    """As above, once the other part of the grid is complete as well."""
+    for run in (kernel, twin):
+        part, shape, operator, state = run.after
+        if operator.inverse and state.projections.shape[1] > 1:
+            naive.complete(1 - part, shape, operator, state)
+            naive.finish(shape, state)
+    exact_but_atoms(kernel, twin)
+
+
 def in_planes(state):
-    """`(plane, row)` of each volume that has entered a plane."""
+    """`(plane, row)` of each volume that has a code in a plane."""
     rows = state.projections.shape[1]
-    return [(plane, row) for plane, cursor in enumerate(state.cursors) for row in range(min(cursor, rows))]
+    coded = state.cursors[:, CURSOR_CODED]
+    return [(plane, row) for plane, cursor in enumerate(coded) for row in range(min(cursor, rows))]
 
 
 def assert_pooled(shape, operator, state):
     """What is pooled are the codes that are there."""
-    pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code)
+    pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code[0])
     for plane, row in in_planes(state):
         naive.fix_atoms(state.atoms[plane, row], operator, fixed)
         naive.pool(fixed, 1, operator.kind, pooled[plane, naive.quadrant(row, shape)])
@@ -252,7 +266,7 @@ def random_volume(rng, kinds=KINDS):
     values = random_values(rng, operator)
     values[0] = values[0] or 1
     projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
-    naive.project_volume(values, operator, projection, moments)
+    projection[:], moments[:] = naive._sums(values, operator)
     return operator, projection, moments
 
 
@@ -302,7 +316,7 @@ def make_move_code(rng):
     operator, projection, moments = random_volume(rng, [kind])
     values = random_values(rng, operator)
     values[0] = values[0] or 1
-    naive.project_volume(values, operator, projection, moments)
+    projection[:], moments[:] = naive._sums(values, operator)
     entry, d = int(rng.integers(0, len(values))), len(values)
     before = int(values[entry])
     after = one_step(rng, before, operator)
@@ -435,7 +449,7 @@ def make_covering(rng):
 
 
 def random_row(rng, state):
-    """`(plane, volume)` of a volume that has entered its plane."""
+    """`(plane, volume)` of a volume that has a code in its plane."""
     return pick(rng, in_planes(state))
 
 
@@ -443,13 +457,14 @@ def make_encode_volume(rng):
     _, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
     place = random_row(rng, state)
     rows = (field[place].copy() for field in (state.projections, state.moments, state.atoms))
-    return *rows, bool(rng.random() < 0.5), operator, state
+    return *rows, bool(rng.random() < 0.5), int(rng.integers(0, PARTS)), operator, state
 
 
 def make_pool_volume(rng):
     shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
     plane, volume = random_row(rng, state)
-    return plane, volume, volume, np.int64(pick(rng, [-1, 1])), shape, operator, state
+    sign, part = np.int64(pick(rng, [-1, 1])), int(rng.integers(0, PARTS))
+    return plane, volume, volume, sign, part, shape, operator, state
 
 
 def one_row(state):
@@ -458,45 +473,58 @@ def one_row(state):
     clock = state.clock.copy()
     clock[CLOCK_PLANE] = 0
     return state._replace(
-        **rows, cursors=np.zeros(1, np.int64), pooled=np.zeros_like(state.pooled[:1]), clock=clock
+        **rows, cursors=np.zeros((1, 3), np.int64), pooled=np.zeros_like(state.pooled[:1]), clock=clock
     )
 
 
-def make_enter_volume(rng):
-    shape, operator, state = parts_of(read_engine(rng))
-    if rng.random() < 0.2:
-        return np.int64(0), np.int64(0), shape, operator, one_row(state)
-    plane = int(rng.integers(0, len(state.cursors)))
-    # As if it were the next to enter: the pooled sums of its plane need not hold it.
-    forget_from(int(rng.integers(0, shape[0] * shape[1])), plane, shape, operator, state)
-    ahead = plane != state.clock[CLOCK_PLANE]
-    return np.int64(plane), np.int64(ahead), shape, operator, state
-
-
-def forget_from(cursor, plane, shape, operator, state):
-    """Let volumes from the cursor on leave a plane; their rows stay as they are."""
-    state.cursors[plane] = min(cursor, state.cursors[plane])
+def rewind(rng, plane, shape, operator, state):
+    """Let a plane be one that volumes are about to enter; rows that leave it stay as they are."""
+    cursors, ahead = state.cursors[plane], int(plane != state.clock[CLOCK_PLANE])
+    projected = int(rng.integers(0, cursors[CURSOR_PROJECTED] + 1))
+    coded = int(rng.integers(0, min(projected, cursors[CURSOR_CODED]) + 1))
+    cursors[:] = coded, projected, 0
+    if projected < shape[0] * shape[1] and rng.random() < 0.5:
+        most = int(rng.integers(0, 9))
+        _, following = naive.project_volume(plane, projected, ahead, 0, most, 0, shape, operator, state)
+        end = (len(state.applied) - ahead) * operator.patch**2
+        cursors[:] = (coded, projected + 1, 0) if following == end else (coded, projected, following)
     state.pooled[plane] = 0
-    for row in range(state.cursors[plane]):
+    for row in range(coded):
         row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
-        naive.encode_volume(*row_of, False, operator, state)
-        naive.pool(state.code, 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
+        naive.encode_volume(*row_of, False, 0, operator, state)
+        naive.pool(state.code[0], 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
+
+
+def random_most(rng):
+    return int(pick(rng, [1, 3, 10**6]))
+
+
+def make_project_volume(rng):
+    shape, operator, state = parts_of(read_engine(rng))
+    part, volumes = int(rng.integers(0, PARTS)), shape[0] * shape[1]
+    if rng.random() < 0.2:
+        plane, volume, start, state = 0, int(rng.integers(0, volumes)), 0, one_row(state)
+    else:
+        plane = int(rng.integers(0, len(state.cursors)))
+        rewind(rng, plane, shape, operator, state)
+        volume, start = min(int(state.cursors[plane, 1]), volumes - 1), int(state.cursors[plane, 2])
+    ahead = int(plane != state.clock[CLOCK_PLANE])
+    return plane, volume, ahead, start, random_most(rng), part, shape, operator, state
 
 
 def make_complete(rng):
     shape, operator, state = parts_of(read_engine(rng))
+    part = int(rng.integers(0, PARTS))
     if rng.random() < 0.3:
-        return shape, operator, one_row(state)
-    forget_from(
-        int(rng.integers(0, shape[0] * shape[1])), int(state.clock[CLOCK_PLANE]), shape, operator, state
-    )
-    return shape, operator, state
+        return part, shape, operator, one_row(state)
+    rewind(rng, int(state.clock[CLOCK_PLANE]), shape, operator, state)
+    return part, shape, operator, state
 
 
 def make_look_ahead(rng):
     shape, operator, state = parts_of(random_engine(rng) if rng.random() < 0.2 else read_engine(rng))
-    goal, budget = int(rng.integers(0, 1 + shape[0] * shape[1])), int(pick(rng, [-1, 0, 1, 30, 10**6]))
-    return goal, budget, shape, operator, state
+    goals = (int(goal) for goal in rng.integers(0, 1 + shape[0] * shape[1], 2))
+    return *goals, int(pick(rng, [-1, 0, 1, 30, 10**6])), shape, operator, state
 
 
 def make_update(rng):
@@ -504,8 +532,34 @@ def make_update(rng):
     return parts_of(engine)
 
 
-def make_apply_touched(rng):
-    return parts_of(read_engine(rng, more=40))
+def engine_with_news(rng):
+    """An engine with events since its last reading, some planes of which are as if they were being filled."""
+    shape, operator, state = parts_of(read_engine(rng, more=40))
+    for plane in range(len(state.cursors)):
+        if rng.random() < 0.3:
+            rewind(rng, plane, shape, operator, state)
+    return shape, operator, state
+
+
+def make_mark_dirty(rng):
+    return engine_with_news(rng)
+
+
+def make_renew(rng):
+    shape, operator, state = engine_with_news(rng)
+    naive.mark_dirty(shape, operator, state)
+    return int(rng.integers(0, PARTS)), shape, operator, state
+
+
+def make_settle(rng):
+    shape, operator, state = engine_with_news(rng)
+    naive.mark_dirty(shape, operator, state)
+    return operator, state
+
+
+def make_finish(rng):
+    shape, _, state = engine_with_news(rng)
+    return shape, state
 
 
 def changed_place(rng, operator, state):
@@ -520,16 +574,19 @@ def make_change_volume(rng):
     shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
     plane, volume = random_row(rng, state)
     ahead = int(plane != state.clock[CLOCK_PLANE])
-    naive._gather(state.applied, ahead, volume, shape, operator, state)
-    filled = np.flatnonzero(state.values)
+    values = naive._gather(state.applied, ahead, volume, shape, operator, state)
+    state.values[0] = values
+    filled = np.flatnonzero(values)
     anywhere = len(filled) == 0 or rng.random() < 0.5
-    entry = int(rng.integers(0, len(state.values)) if anywhere else pick(rng, filled))
-    before = int(state.values[entry])
-    return plane, volume, entry, before, one_step(rng, before, operator), shape, operator, state
+    entry = int(rng.integers(0, len(values)) if anywhere else pick(rng, filled))
+    before = int(values[entry])
+    return plane, volume, entry, one_step(rng, before, operator) - before, shape, operator, state
 
 
 def make_change_place(rng):
     shape, operator, state = parts_of(read_engine(rng))
+    if len(state.cursors) > 1:
+        rewind(rng, 1 - int(state.clock[CLOCK_PLANE]), shape, operator, state)
     return changed_place(rng, operator, state), shape, operator, state
 
 
@@ -553,27 +610,62 @@ def make_change_moments(rng):
     return *(int(count) for count in rng.integers(-100, 101, 2)), moments
 
 
-def make_change_entry(rng):
+def make_add_columns(rng):
+    operator, projection, _ = random_volume(rng)
+    entries, changes, n = random_changes(rng, operator, random_values(rng, operator))
+    return n, entries, changes, operator.columns, projection
+
+
+def random_changes(rng, operator, values):
+    """Some entries and how much they change, so that none leaves the range of clipped counts."""
+    n = int(rng.integers(0, len(values) + 1))
+    entries, limit = rng.permutation(len(values)).astype(np.int32), min(operator.max_count, 100)
+    return entries, rng.integers(-limit, limit + 1, len(values)).astype(np.int16) - values[entries], n
+
+
+def make_change_entries(rng):
     operator, projection, moments = random_volume(rng)
-    values = random_values(rng, operator)
-    entry, after = int(rng.integers(0, len(values))), int(rng.integers(-1, 2)) * operator.max_count
-    return entry, int(values[entry]), after, values, operator, projection, moments
+    values = random_values(rng, operator).clip(-100, 100)
+    entries, changes, n = random_changes(rng, operator, values)
+    return n, entries, changes, values, operator, projection, moments
+
+
+def random_place(rng):
+    """A ring of clipped counts, and where a volume lies in it."""
+    operator = random_engine(rng).encoder.operator
+    patch, d = operator.patch, len(operator.columns)
+    n_bins = d // patch**2
+    height, width = (patch + int(more) for more in rng.integers(0, 6, 2))
+    ring = rng.integers(-2, 3, (n_bins, height, width)).astype(np.int16)
+    ring[rng.random(ring.shape) < rng.random()] = 0
+    top, left = int(rng.integers(0, height - patch + 1)), int(rng.integers(0, width - patch + 1))
+    return ring, int(rng.integers(0, n_bins)), top, left, patch, d
 
 
 def make_gather_volume(rng):
-    operator = random_engine(rng).encoder.operator
-    patch, values = operator.patch, random_values(rng, operator)
-    n_bins = len(values) // patch**2
-    height, width = (patch + int(more) for more in rng.integers(0, 6, 2))
-    ring = rng.integers(-2, 3, (n_bins, height, width)).astype(np.int16)
-    top, left = int(rng.integers(0, height - patch + 1)), int(rng.integers(0, width - patch + 1))
-    first_slot, filled_bins = int(rng.integers(0, n_bins)), n_bins - int(rng.integers(0, 2))
-    return ring, first_slot, filled_bins, top, left, patch, values
+    ring, first_slot, top, left, patch, d = random_place(rng)
+    return ring, first_slot, int(rng.integers(0, d + 1)), top, left, patch, np.ones(d, np.int16)
 
 
-def make_project_volume(rng):
-    operator, projection, moments = random_volume(rng)
-    return random_values(rng, operator), operator, projection, moments
+def make_list_filled(rng):
+    ring, first_slot, top, left, patch, d = random_place(rng)
+    end = d - int(pick(rng, [0, patch**2]))
+    start = int(rng.integers(0, end + 1))
+    lists = np.zeros(d, np.int32), np.zeros(d, np.int16)
+    return ring, first_slot, start, end, random_most(rng), top, left, patch, *lists
+
+
+def make_list_changed(rng):
+    ring, first_slot, top, left, patch, d = random_place(rng)
+    counts = ring + rng.integers(-1, 2, ring.shape).astype(np.int32)
+    slots = (rng.random(len(ring)) < 0.8).astype(np.uint8)
+    lists = np.zeros(d, np.int32), np.zeros(d, np.int16), np.zeros(d, np.int16)
+    end = int(rng.integers(0, d + 1))
+    return counts, ring.clip(-1, 1), 1, slots, first_slot, end, top, left, patch, *lists
+
+
+def make_lower_half(rng):
+    return (tuple(int(side) for side in rng.integers(1, 9, 2)),)
 
 
 @dataclass(frozen=True)
@@ -612,21 +704,27 @@ KERNELS = [
     Row(lasso.lasso_code, make_lasso_code, lasso_code_within_gap),
     Row(lasso.fix_atoms, make_fix_atoms),
     Row(lasso.solve_lasso_rows, make_solve_lasso_rows, rows_within_gap),
+    Row(encode.lower_half, make_lower_half),
     Row(encode.quadrant, make_quadrant),
     Row(encode.covering, make_covering, same_range),
     Row(encode.encode_volume, make_encode_volume),
     Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
-    Row(planes.enter_volume, make_enter_volume, exact_but_atoms),
-    Row(planes.complete, make_complete, exact_but_atoms),
+    Row(planes.project_volume, make_project_volume, exact_but_scratch),
+    Row(planes.complete, make_complete, exact_but_atoms_of_a_part),
     Row(planes.look_ahead, make_look_ahead, exact_but_atoms),
-    Row(update.apply_touched, make_apply_touched, exact_but_atoms),
+    Row(update.mark_dirty, make_mark_dirty, exact_but_scratch),
+    Row(update.renew, make_renew, exact_but_atoms),
+    Row(update.settle, make_settle),
+    Row(update.finish, make_finish),
     Row(update.update, make_update, exact_but_atoms),
     Row(follow.change_volume, make_change_volume, exact_but_scratch),
     Row(follow.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
     Row(volume.add_column, make_add_column),
     Row(volume.change_moments, make_change_moments),
-    Row(volume.change_entry, make_change_entry),
+    Row(volume.add_columns, make_add_columns),
+    Row(volume.change_entries, make_change_entries),
     Row(volume.gather_volume, make_gather_volume),
-    Row(volume.project_volume, make_project_volume),
+    Row(volume.list_filled, make_list_filled),
+    Row(volume.list_changed, make_list_changed),
 ]

@@ -7,17 +7,20 @@ import numpy as np
 
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
+    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
     CLOCK_START,
     CLOCK_TOUCHED,
+    CURSOR_CODED,
+    CURSOR_ENTRY,
+    CURSOR_PROJECTED,
     MOMENT_LINEAR,
     MOMENT_QUADRATIC,
     MOMENT_SQUARES,
     MOMENT_SUM,
     SPLIT,
-    TALLY_ENCODED,
     TALLY_EVENTS,
     TALLY_LATE,
     TALLY_REJECTED,
@@ -128,7 +131,7 @@ def triangle_code(projection, sigma, square, operator, code):
 
 def pool(code, sign, kind, pooled):
     code = code.astype(np.int64)
-    parts = [code.clip(0), (-code).clip(0)] if kind == SPLIT else [code]
+    parts = [code, np.abs(code)] if kind == SPLIT else [code]
     pooled += sign * np.concatenate(parts)
 
 
@@ -276,39 +279,66 @@ def add_column(change, column, projection):
     projection += change * column.astype(np.int32)
 
 
+def add_columns(n, entries, changes, columns, projection):
+    projection += changes[:n].astype(np.int64) @ columns[entries[:n]].astype(np.int64)
+
+
 def change_moments(before, after, moments):
     moments[MOMENT_SUM] += int(after) - int(before)
     moments[MOMENT_SQUARES] += int(after) ** 2 - int(before) ** 2
 
 
-def gather_volume(ring, first_slot, filled_bins, top, left, patch, values):
-    oldest_first = np.roll(ring, -first_slot, axis=0)
-    oldest_first[filled_bins:] = 0
-    values[:] = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
-    return np.count_nonzero(values)
-
-
-def project_volume(values, operator, projection, moments):
-    v = values.astype(np.int64)
-    projection[:] = v @ operator.columns.astype(np.int64)
-    moments[:] = 0
+def _sums(values, operator):
+    """Projection and moments of a volume, from nothing."""
+    v, moments = values.astype(np.int64), np.zeros(4, np.int64)
     moments[MOMENT_SUM], moments[MOMENT_SQUARES] = v.sum(), v @ v
     if operator.quadratic.size:
         moments[MOMENT_QUADRATIC] = v @ operator.quadratic.astype(np.int64) @ v
         moments[MOMENT_LINEAR] = v @ operator.linear.astype(np.int64)
+    return (v @ operator.columns.astype(np.int64)).astype(np.int32), moments
 
 
-def change_entry(entry, before, after, values, operator, projection, moments):
-    projections, sums = np.zeros((2, len(projection)), np.int32), np.zeros((2, 4), np.int64)
-    for i, count in enumerate((before, after)):
-        volume = values.copy()
-        volume[entry] = count
-        project_volume(volume, operator, projections[i], sums[i])
-    projection += projections[1] - projections[0]
-    moments += sums[1] - sums[0]
+def change_entries(n, entries, changes, values, operator, projection, moments):
+    before = _sums(values, operator)
+    values[entries[:n]] += changes[:n]
+    after = _sums(values, operator)
+    projection += after[0] - before[0]
+    moments += after[1] - before[1]
+
+
+def gather_volume(ring, first_slot, end, top, left, patch, values):
+    oldest_first = np.roll(ring, -first_slot, axis=0)
+    values[:] = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
+    values[end:] = 0
+
+
+def list_filled(ring, first_slot, start, end, most, top, left, patch, entries, changes):
+    values = np.zeros(len(entries), np.int16)
+    gather_volume(ring, first_slot, end, top, left, patch, values)
+    values[:start] = 0
+    filled = np.flatnonzero(values)
+    listed = filled[:most]
+    entries[: len(listed)], changes[: len(listed)] = listed, values[listed]
+    return len(listed), int(filled[most]) if len(filled) > most else end
+
+
+def list_changed(counts, applied, limit, slots, first_slot, end, top, left, patch, entries, changes, values):
+    now, was = np.zeros((2, len(values)), np.int64)
+    clipped = counts.clip(-limit, limit)
+    clipped[slots == 0] = applied[slots == 0]
+    gather_volume(clipped, first_slot, end, top, left, patch, now)
+    gather_volume(applied, first_slot, end, top, left, patch, was)
+    listed = np.flatnonzero(now != was)
+    n = len(listed)
+    entries[:n], changes[:n], values[listed] = listed, (now - was)[listed], was[listed]
+    return n
 
 
 # streamfeat.kernels.encode
+
+
+def lower_half(shape):
+    return math.ceil(shape[0] / 2) * shape[1]
 
 
 def quadrant(volume, shape):
@@ -323,9 +353,10 @@ def covering(pixel, count, operator):
     return (volumes[0], volumes[-1] + 1) if len(volumes) else (0, 0)
 
 
-def encode_volume(projection, moments, atoms, fresh, operator, state):
+def encode_volume(projection, moments, atoms, fresh, part, operator, state):
+    code = state.code[part]
     if moments[MOMENT_SQUARES] == 0:
-        state.code[:] = 0
+        code[:] = 0
         if fresh:
             atoms[:] = 0
         return
@@ -334,133 +365,193 @@ def encode_volume(projection, moments, atoms, fresh, operator, state):
     if operator.inverse:
         if fresh:
             lasso_code(projection, sigma, square, operator, atoms, None, None)
-        fix_atoms(atoms, operator, state.code)
+        fix_atoms(atoms, operator, code)
     elif operator.kind == TRIANGLE:
-        triangle_code(projection, sigma, square, operator, state.code)
+        triangle_code(projection, sigma, square, operator, code)
     else:
-        soft_code(projection, sigma, operator, state.code)
+        soft_code(projection, sigma, operator, code)
 
 
-def pool_volume(plane, row, volume, sign, shape, operator, state):
+def pool_volume(plane, row, volume, sign, part, shape, operator, state):
     row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
-    encode_volume(*row_of, sign > 0, operator, state)
-    pool(state.code, sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
-    state.tally[TALLY_ENCODED] += sign > 0
+    encode_volume(*row_of, sign > 0, part, operator, state)
+    pool(state.code[part], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+    state.encoded[part] += sign > 0
 
 
 # streamfeat.kernels.planes
 
 
-def _first_pixels(volume, shape, operator):
-    return [index * operator.stride for index in divmod(volume, shape[1])]
-
-
 def _gather(ring, ahead, volume, shape, operator, state):
-    """Entries of a volume as they are after `ahead` more bins; how many are not zero."""
+    """Entries of a volume as they are after `ahead` more bins."""
     n_bins, now = len(ring), int(state.clock[CLOCK_NOW])
-    top, left = _first_pixels(volume, shape, operator)
-    first_slot = (now + 1 + ahead) % n_bins
-    return gather_volume(ring, first_slot, n_bins - ahead, top, left, operator.patch, state.values)
+    top, left = (index * operator.stride for index in divmod(volume, shape[1]))
+    values = np.zeros(state.values.shape[1], np.int64)
+    end = (n_bins - ahead) * operator.patch**2
+    gather_volume(ring, (now + 1 + ahead) % n_bins, end, top, left, operator.patch, values)
+    return values
 
 
-def enter_volume(plane, ahead, shape, operator, state):
-    volume = int(state.cursors[plane])
-    state.cursors[plane] += 1
+def project_volume(plane, volume, ahead, start, most, part, shape, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
-    filled = _gather(state.applied, ahead, volume, shape, operator, state)
-    project_volume(state.values, operator, state.projections[plane, row], state.moments[plane, row])
-    if filled:
-        pool_volume(plane, row, volume, 1, shape, operator, state)
+    values = _gather(state.applied, ahead, volume, shape, operator, state)
+    (filled,) = np.nonzero(values[start:])
+    end = (len(state.applied) - ahead) * operator.patch**2
+    following = int(start + filled[most]) if len(filled) > most else end
+    values[following:] = 0
+    state.projections[plane, row], state.moments[plane, row] = _sums(values, operator)
+    return min(most, len(filled)), following
+
+
+def _encode_row(plane, volume, part, shape, operator, state):
+    row = volume if state.projections.shape[1] > 1 else 0
+    if state.moments[plane, row].any():
+        pool_volume(plane, row, volume, 1, part, shape, operator, state)
     else:
         state.atoms[plane, row] = 0
-    return filled
 
 
-def complete(shape, operator, state):
-    plane = int(state.clock[CLOCK_PLANE])
-    for _ in range(int(state.cursors[plane]), shape[0] * shape[1]):
-        enter_volume(plane, 0, shape, operator, state)
+def complete(part, shape, operator, state):
+    plane, half = int(state.clock[CLOCK_PLANE]), lower_half(shape)
+    cursors, everything = state.cursors[plane], state.values.shape[1]
+    for volume in [range(half), range(half, shape[0] * shape[1])][part]:
+        if volume >= cursors[CURSOR_PROJECTED]:
+            project_volume(plane, volume, 0, 0, everything, part, shape, operator, state)
+        if volume >= cursors[CURSOR_CODED]:
+            _encode_row(plane, volume, part, shape, operator, state)
 
 
-def look_ahead(goal, budget, shape, operator, state):
+def look_ahead(projected, coded, budget, shape, operator, state):
     current, volumes = int(state.clock[CLOCK_PLANE]), shape[0] * shape[1]
-    if len(state.cursors) == 1 or state.cursors[current] != volumes:
+    if len(state.cursors) == 1 or state.cursors[current, CURSOR_CODED] != volumes:
         return budget
-    plane = 1 - current
-    for volume in range(int(state.cursors[plane]), min(goal, volumes)):
-        if budget <= 0:
-            break
-        was_filled = state.moments[plane, volume].any()
-        is_filled = _gather(state.applied, 0, volume, shape, operator, state) > 0
-        filled = enter_volume(plane, 1, shape, operator, state)
-        if was_filled or is_filled:
-            budget -= 4 + filled
+    plane, part = 1 - current, 0
+    cursors = state.cursors[plane]
+    while budget > 0 and cursors[CURSOR_PROJECTED] < projected:
+        volume, start = (int(cursor) for cursor in cursors[[CURSOR_PROJECTED, CURSOR_ENTRY]])
+        held = start or state.moments[plane, volume].any()
+        n, following = project_volume(plane, volume, 1, start, budget, part, shape, operator, state)
+        if held or _gather(state.applied, 0, volume, shape, operator, state).any():
+            budget -= 1 + n
+        if following == (len(state.applied) - 1) * operator.patch**2:
+            volume, following = volume + 1, 0
+        cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY] = volume, following
+    while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
+        volume = int(cursors[CURSOR_CODED])
+        _encode_row(plane, volume, part, shape, operator, state)
+        budget -= 6 * state.moments[plane, volume].any()
+        cursors[CURSOR_CODED] += 1
     return budget
 
 
 # streamfeat.kernels.update
 
 
-def _follow_counts(after, shape, operator, state):
-    """Every volume of every plane from the clipped counts `after`; lasso codes again where they changed."""
-    before = state.applied.copy()
-    state.applied[:] = after
-    encoded = 0
-    for plane, cursor in enumerate(state.cursors):
+def _entries_in(plane, volume, state):
+    """How many entries of a volume are in its projection in a plane."""
+    cursors = state.cursors[plane]
+    if volume == cursors[CURSOR_PROJECTED]:
+        return int(cursors[CURSOR_ENTRY])
+    return state.values.shape[1] if volume < cursors[CURSOR_PROJECTED] else 0
+
+
+def _changed_volumes(after, shape, operator, state):
+    """`(plane, volume, entries)` of every volume whose entries are not those that were applied."""
+    for plane in range(len(state.cursors)):
         ahead = int(plane != state.clock[CLOCK_PLANE])
-        state.pooled[plane] = 0
-        for volume in range(cursor):
-            _gather(before, ahead, volume, shape, operator, state)
-            old = state.values.copy()
-            _gather(after, ahead, volume, shape, operator, state)
-            changed = bool((state.values != old).any())
-            encoded += changed
-            row_of = [field[plane, volume] for field in (state.projections, state.moments, state.atoms)]
-            project_volume(state.values, operator, *row_of[:2])
-            encode_volume(*row_of, changed, operator, state)
-            pool(state.code, 1, operator.kind, state.pooled[plane, quadrant(volume, shape)])
-    state.tally[TALLY_ENCODED] += encoded
+        for volume in range(shape[0] * shape[1]):
+            old, new = (
+                _gather(ring, ahead, volume, shape, operator, state) for ring in (state.applied, after)
+            )
+            end = _entries_in(plane, volume, state)
+            new[end:] = 0
+            if (new[:end] != old[:end]).any():
+                yield plane, volume, new
 
 
-def apply_touched(shape, operator, state):
-    clipped = state.counts.clip(-operator.max_count, operator.max_count).astype(np.int16)
-    _follow_counts(clipped, shape, operator, state)
+def _follow_volume(plane, volume, values, part, shape, operator, state):
+    coded = volume < state.cursors[plane, CURSOR_CODED]
+    if coded:
+        pool_volume(plane, volume, volume, -1, part, shape, operator, state)
+    state.projections[plane, volume], state.moments[plane, volume] = _sums(values, operator)
+    if coded:
+        pool_volume(plane, volume, volume, 1, part, shape, operator, state)
+
+
+def _clipped(operator, state):
+    return state.counts.clip(-operator.max_count, operator.max_count).astype(np.int16)
+
+
+def mark_dirty(shape, operator, state):
+    after, n_volumes = _clipped(operator, state), shape[0] * shape[1]
+    changed = _changed_volumes(after, shape, operator, state)
+    dirty = [plane * n_volumes + volume for plane, volume, _ in changed]
+    state.touched_slots[:] = (after != state.applied).any(axis=(1, 2))
+    state.is_dirty[dirty] = 1
+    state.dirty[: len(dirty)] = dirty
+    state.clock[CLOCK_DIRTY] = len(dirty)
+
+
+def renew(part, shape, operator, state):
+    for plane, volume, values in list(_changed_volumes(_clipped(operator, state), shape, operator, state)):
+        if part == (volume >= lower_half(shape)):
+            _follow_volume(plane, volume, values, part, shape, operator, state)
+
+
+def settle(operator, state):
+    state.applied[:] = _clipped(operator, state)
     state.is_touched[:] = 0
-    state.clock[CLOCK_TOUCHED] = 0
+    state.is_dirty[:] = 0
+    state.clock[[CLOCK_TOUCHED, CLOCK_DIRTY]] = 0
+
+
+def finish(shape, state):
+    state.cursors[int(state.clock[CLOCK_PLANE])] = shape[0] * shape[1], shape[0] * shape[1], 0
 
 
 def update(shape, operator, state):
-    apply_touched(shape, operator, state)
-    complete(shape, operator, state)
+    mark_dirty(shape, operator, state)
+    for part in range(2):
+        renew(part, shape, operator, state)
+    settle(operator, state)
+    for part in range(2):
+        complete(part, shape, operator, state)
+    finish(shape, state)
 
 
 # streamfeat.kernels.follow
 
 
-def change_volume(plane, volume, entry, before, after, shape, operator, state):
-    pool_volume(plane, volume, volume, -1, shape, operator, state)
-    row_of = state.projections[plane, volume], state.moments[plane, volume]
-    change_entry(entry, before, after, state.values, operator, *row_of)
-    pool_volume(plane, volume, volume, 1, shape, operator, state)
+def change_volume(plane, volume, entry, change, shape, operator, state):
+    values = _gather(state.applied, int(plane != state.clock[CLOCK_PLANE]), volume, shape, operator, state)
+    values[_entries_in(plane, volume, state) :] = 0
+    values[entry] += change
+    _follow_volume(plane, volume, values, 0, shape, operator, state)
 
 
 def change_place(place, shape, operator, state):
     after = state.applied.copy()
-    after.reshape(-1)[place] = np.clip(
-        state.counts.reshape(-1)[place], -operator.max_count, operator.max_count
-    )
-    _follow_counts(after, shape, operator, state)
+    after.reshape(-1)[place] = _clipped(operator, state).reshape(-1)[place]
+    for plane, volume, values in list(_changed_volumes(after, shape, operator, state)):
+        _follow_volume(plane, volume, values, 0, shape, operator, state)
+    state.applied[:] = after
 
 
 def follow(events, height, width, shape, operator, state):
+    n_volumes = shape[0] * shape[1]
     for event in events.tolist():
         place = count_event(*event, height, width, operator, state)
-        complete(shape, operator, state)
+        if state.cursors[int(state.clock[CLOCK_PLANE]), CURSOR_CODED] < n_volumes:
+            for part in range(2):
+                complete(part, shape, operator, state)
+            finish(shape, state)
         if place >= 0:
             change_place(place, shape, operator, state)
         part_of_bin = Fraction(event[3] - int(state.clock[CLOCK_START]), operator.bin_us)
-        goal = math.floor(shape[0] * shape[1] * min(max(part_of_bin, 0), 1) * Fraction(5, 4))
-        look_ahead(goal, 96, shape, operator, state)
+        part_of_bin = min(max(part_of_bin, 0), 1)
+        projected = math.floor(n_volumes * min(part_of_bin * Fraction(4, 3), 1))
+        coded = math.floor(n_volumes * max(8 * part_of_bin - 6, 0))
+        look_ahead(projected, coded, 96, shape, operator, state)
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

@@ -14,7 +14,7 @@ from streamfeat.events import EVENT_DTYPE, make_events
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import count_events
-from streamfeat.kernels.layout import CLOCK_PLANE
+from streamfeat.kernels.layout import CLOCK_PLANE, CURSOR_CODED, CURSOR_ENTRY, CURSOR_PROJECTED
 from streamfeat.kernels.update import update
 
 ids = "-".join
@@ -460,20 +460,22 @@ def test_events_after_preparing_are_in_what_was_prepared(kind):
         assert_certified(engine._operator, engine._state)
 
 
-def test_following_prepares_the_boundary_before_four_fifths_of_the_bin():
+def test_following_prepares_the_boundary_within_seven_eighths_of_the_bin():
     case = known_case()
     engine, _, boundary = a_full_window(case)
     engine.features()
     bin_us, volumes = case.geometry.bin_us, engine.grid_shape[0] * engine.grid_shape[1]
-    start = boundary - bin_us
-    for t in range(start, start + bin_us * 4 // 5, 4):
-        before = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]]
+    start, last = boundary - bin_us, np.zeros(3, int)
+    for t in range(start, start + bin_us * 7 // 8, 4):
         engine.follow(make_events([5], [5], [t // 4 % 2], [t]))
-        after = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]]
-        assert after - before <= 5  # spread out
-        assert after <= (t - start + 1) * volumes * 1.25 / bin_us
-    engine.follow(make_events([5], [5], [1], [start + bin_us * 4 // 5]))
-    assert engine._state.cursors.tolist() == [volumes, volumes]
+        coming = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]].copy()
+        assert (coming[:CURSOR_ENTRY] - last[:CURSOR_ENTRY]).max() <= 5  # spread out
+        elapsed = (t - start + 1) / bin_us
+        assert coming[CURSOR_PROJECTED] <= volumes * elapsed * 4 / 3
+        assert coming[CURSOR_CODED] <= volumes * max(8 * elapsed - 6, 0)
+        last = coming
+    engine.follow(make_events([5], [5], [1], [start + bin_us * 7 // 8]))
+    assert engine._state.cursors.tolist() == [[volumes, volumes, 0]] * 2
     assert engine.prepare(1)
 
 

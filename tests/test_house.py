@@ -13,12 +13,13 @@ import streamfeat
 PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
-    {"errors", "events", "kernels.layout"},
+    {"errors", "events", "kernels.compiled", "kernels.layout"},
     {"geometry", "files", "messages", "mcap_records", "svm", "simulate"},
     {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
     {"kernels.encode", "codecs", "safe_arrays"},
     {"kernels.planes"},
-    {"kernels.update", "kernels.follow"},
+    {"kernels.update"},
+    {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
     {"encoder", "sinks"},
@@ -42,8 +43,7 @@ ONLY_IN = {
     "mcap": {"mcap_records", "recording", "recorder"},
     "zenoh": {"live"},
     "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.streaming"},
-    "numba": {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"}
-    | {"kernels.encode", "kernels.planes", "kernels.update", "kernels.follow"},
+    "numba": {"kernels.compiled", "kernels.lasso"},
 }
 
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}
@@ -192,15 +192,15 @@ def test_nothing_in_a_module_can_run_what_it_reads_or_reorder_floats(name):
 
 
 @pytest.mark.parametrize("name", sorted(n for n in NAMES if n.startswith("kernels.")))
-def test_a_kernel_is_cached_and_releases_the_gil(name):
+def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
         if isinstance(node, ast.FunctionDef):
             (decorator,) = node.decorator_list
-            assert isinstance(decorator, ast.Call)
-            options = {keyword.arg: keyword.value.value for keyword in decorator.keywords}
-            assert options["cache"]
-            assert options["nogil"]
-            assert set(options) <= {"cache", "nogil", "parallel"}
+            if isinstance(decorator, ast.Name):
+                assert decorator.id in {"kernel", "inlined"}
+            else:  # on all cores, which must count references
+                options = {keyword.arg: keyword.value.value for keyword in decorator.keywords}
+                assert options == {"cache": True, "nogil": True, "parallel": True}
 
 
 @modules(packages=True)

@@ -10,9 +10,9 @@ the bits do not depend on how the loop is vectorised. Whatever is summed is an i
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.layout import (
     MOMENT_LINEAR,
     MOMENT_QUADRATIC,
@@ -23,14 +23,14 @@ from streamfeat.kernels.layout import (
 )
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def deviation(moments: NDArray[np.int64], entries: int, eps: float) -> float:
     """Standard deviation of a volume's entries, `sqrt(mean of squares - square of mean + eps)`."""
     mean = moments[MOMENT_SUM] / entries
     return math.sqrt(moments[MOMENT_SQUARES] / entries - mean * mean + eps)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator) -> float:
     """`|x|^2` of a volume, from its quadratic and linear form; from 0 to the square of `operator.reach`."""
     quadratic = moments[MOMENT_QUADRATIC] * operator.quadratic_scale / (sigma * sigma)
@@ -38,7 +38,7 @@ def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator
     return min(max(quadratic - 2.0 * linear + operator.constant, 0.0), operator.reach * operator.reach)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def soft_code(
     projection: NDArray[np.int32], sigma: float, operator: Operator, code: NDArray[np.int32]
 ) -> None:
@@ -53,7 +53,7 @@ def soft_code(
         code[k] = np.int32(z - min(max(z, -threshold), threshold))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def triangle_code(
     projection: NDArray[np.int32],
     sigma: float,
@@ -88,28 +88,25 @@ def triangle_code(
     code[n_filters:] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32]) -> None:
     """Add (`sign` 1) or take away (`sign` -1) the code of one volume from the sums of its quadrant.
 
     Args:
         code: `(Kp,)` fixed point; not changed.
         sign: 1 or -1.
-        kind: SPLIT sums the positive and the negative part apart.
+        kind: SPLIT sums absolute values too.
         pooled: `(F,)`, changed.
     """
     width = code.shape[0]
+    for k in range(width):
+        pooled[k] += sign * code[k]
     if kind == SPLIT:
         for k in range(width):
-            pooled[k] += sign * max(code[k], 0)
-        for k in range(width):
-            pooled[width + k] += sign * max(-code[k], 0)
-    else:
-        for k in range(width):
-            pooled[k] += sign * code[k]
+            pooled[width + k] += sign * abs(code[k])
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def move_code(
     change: int,
     column: NDArray[np.int16],
@@ -136,28 +133,19 @@ def move_code(
     before = np.float32(operator.scale * operator.unit / sigma_before)
     after = np.float32(operator.scale * operator.unit / sigma_after)
     threshold = np.float32(operator.threshold)
-    # In int16, which a column fits: a product of 32 bits is the slowest instruction of this loop.
-    step, offset = np.int16(change), operator.offset
     width = projection.shape[0]
-    if operator.kind == SPLIT:
-        positive, negative = pooled[:width], pooled[width:]
-        for k in range(width):
-            q = projection[k]
-            moved = np.int32(q + np.int32(np.int16(step * column[k])))
-            projection[k] = moved
-            z = np.float32(q) * before - offset[k]
-            old = np.int32(z - min(max(z, -threshold), threshold))
-            z = np.float32(moved) * after - offset[k]
-            new = np.int32(z - min(max(z, -threshold), threshold))
-            positive[k] += max(new, 0) - max(old, 0)
-            negative[k] += max(-new, 0) - max(-old, 0)
-    else:
-        for k in range(width):
-            q = projection[k]
-            moved = np.int32(q + np.int32(np.int16(step * column[k])))
-            projection[k] = moved
-            z = np.float32(q) * before - offset[k]
-            old = np.int32(z - min(max(z, -threshold), threshold))
-            z = np.float32(moved) * after - offset[k]
-            new = np.int32(z - min(max(z, -threshold), threshold))
-            pooled[k] += new - old
+    offset, sums, sizes = operator.offset, pooled[:width], pooled[width:]
+    # Conditions that hold for the whole run: the compiler makes a loop for each case. A product of column and
+    # change instead would be the slowest instruction of them all.
+    up, split = change > 0, operator.kind == SPLIT
+    for k in range(width):
+        q, c = projection[k], np.int32(column[k])
+        moved = np.int32(q + c) if up else np.int32(q - c)
+        projection[k] = moved
+        z = np.float32(q) * before - offset[k]
+        old = np.int32(z - min(max(z, -threshold), threshold))
+        z = np.float32(moved) * after - offset[k]
+        new = np.int32(z - min(max(z, -threshold), threshold))
+        sums[k] += new - old
+        if split:
+            sizes[k] += abs(new) - abs(old)

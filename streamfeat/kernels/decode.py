@@ -6,10 +6,10 @@ see `streamfeat.codecs`.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from streamfeat.events import Events
+from streamfeat.kernels.compiled import kernel
 
 __all__ = ["decode_evt3", "decode_libcaer_cmp"]
 
@@ -17,7 +17,7 @@ __all__ = ["decode_evt3", "decode_libcaer_cmp"]
 TIME_HIGH_BACKSTEP = 10
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode_evt3(words: NDArray[np.uint16], state: NDArray[np.int64], out: Events) -> int:
     """Decode EVT3 words; `state` carries what the next packet needs.
 
@@ -72,7 +72,7 @@ def decode_evt3(words: NDArray[np.uint16], state: NDArray[np.int64], out: Events
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode_libcaer_cmp(words: NDArray[np.uint16], base_us: int, state: NDArray[np.int64], out: Events) -> int:
     """Decode libcaer_cmp words; time starts again with each packet, addresses carry over.
 

@@ -5,70 +5,86 @@ Not here: the codes themselves (`code`, `lasso`), and which volume is encoded wh
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from streamfeat.kernels.code import deviation, pool, soft_code, triangle_code, whitened_square
+from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.lasso import fix_atoms, lasso_code
-from streamfeat.kernels.layout import MOMENT_SQUARES, TALLY_ENCODED, TRIANGLE, Operator, State
+from streamfeat.kernels.layout import MOMENT_SQUARES, TRIANGLE, Operator, State
 
 ADD, TAKE = np.int64(1), np.int64(-1)
 """NumPy scalars, because a kernel is compiled once more for each Python literal it is called with."""
 
 
-@njit(cache=True, nogil=True)
+@inlined
+def lower_half(shape: tuple[int, int]) -> int:
+    """The first volume of the lower half of the grid: quadrants 2 and 3, and the second of the two parts."""
+    return (shape[0] + 1) // 2 * shape[1]
+
+
+@inlined
 def quadrant(volume: int, shape: tuple[int, int]) -> int:
     """Quadrant of a volume: 0 top left, 1 top right, 2 bottom left, 3 bottom right."""
-    row, column = volume // shape[1], volume % shape[1]
-    return 2 * (2 * row >= shape[0]) + (2 * column >= shape[1])
+    column = volume % shape[1]
+    return 2 * (volume >= lower_half(shape)) + (2 * column >= shape[1])
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def covering(pixel: int, count: int, operator: Operator) -> tuple[int, int]:
     """First and last plus one of the `count` volumes along one axis that cover a pixel."""
     first = max(0, (pixel - operator.patch + operator.stride) // operator.stride)
     return first, min(count, pixel // operator.stride + 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def encode_volume(
     projection: NDArray[np.int32],
     moments: NDArray[np.int64],
     atoms: NDArray[np.float32],
     fresh: bool,
+    part: int,
     operator: Operator,
     state: State,
 ) -> None:
-    """Write the code of a volume to `state.code`; a volume whose counts are all zero has code zero.
+    """Write the code of a volume to `state.code[part]`; a volume whose counts are all zero has code zero.
 
     Args:
         projection: `(Kp,)` of the volume.
         moments: `(4,)` of the volume.
         atoms: `(K,)` last lasso code; changed when `fresh`.
         fresh: solve the lasso again (True), or show the code that was found last (False).
+        part: whose scratch to use.
         operator: the encoder.
-        state: `code`, `work` and `active` are overwritten.
+        state: `code`, `work` and `active` of the part are overwritten.
     """
+    code = state.code[part]
     if moments[MOMENT_SQUARES] == 0:
         if fresh:
             atoms[:] = 0
-        state.code[:] = 0
+        code[:] = 0
         return
     sigma = deviation(moments, operator.columns.shape[0], operator.eps)
     if operator.inverse:
         if fresh:
             square = whitened_square(moments, sigma, operator)
-            lasso_code(projection, sigma, square, operator, atoms, state.work, state.active)
-        fix_atoms(atoms, operator, state.code)
+            lasso_code(projection, sigma, square, operator, atoms, state.work[part], state.active[part])
+        fix_atoms(atoms, operator, code)
     elif operator.kind == TRIANGLE:
-        triangle_code(projection, sigma, whitened_square(moments, sigma, operator), operator, state.code)
+        triangle_code(projection, sigma, whitened_square(moments, sigma, operator), operator, code)
     else:
-        soft_code(projection, sigma, operator, state.code)
+        soft_code(projection, sigma, operator, code)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pool_volume(
-    plane: int, row: int, volume: int, sign: int, shape: tuple[int, int], operator: Operator, state: State
+    plane: int,
+    row: int,
+    volume: int,
+    sign: int,
+    part: int,
+    shape: tuple[int, int],
+    operator: Operator,
+    state: State,
 ) -> None:
     """Encode one volume, and add it to the pooled sums of its plane or take what was added from them.
 
@@ -77,14 +93,16 @@ def pool_volume(
         row: where its projection is; `volume`, but where volumes share a row.
         volume: which.
         sign: ADD its code as it is now, or TAKE away the code it had.
+        part: whose scratch to use.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
-        state: `pooled`, `atoms`, `tally` and scratch are changed.
+        state: `pooled`, `atoms`, `encoded` and scratch are changed.
     """
-    moments = state.moments[plane, row]
+    projection, moments = state.projections[plane, row], state.moments[plane, row]
+    atoms = state.atoms[plane, row]
     fresh = sign == ADD
-    encode_volume(state.projections[plane, row], moments, state.atoms[plane, row], fresh, operator, state)
+    encode_volume(projection, moments, atoms, fresh, part, operator, state)
     if fresh:
-        state.tally[TALLY_ENCODED] += 1
+        state.encoded[part] += 1
     if moments[MOMENT_SQUARES] != 0:
-        pool(state.code, sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+        pool(state.code[part], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])

@@ -5,77 +5,69 @@ Not here: events that are only counted, to be read together (`ingest`, `update`)
 """
 
 import numpy as np
-from numba import njit
 
 from streamfeat.events import Events
 from streamfeat.kernels.code import deviation, move_code
+from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant
 from streamfeat.kernels.ingest import UNCHANGED, count_event
 from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_PLANE,
     CLOCK_START,
+    CURSOR_CODED,
+    CURSOR_ENTRY,
+    CURSOR_PROJECTED,
     MOMENT_SQUARES,
-    TALLY_ENCODED,
+    PARTS,
     TRIANGLE,
     Operator,
     State,
 )
 from streamfeat.kernels.planes import complete, look_ahead
-from streamfeat.kernels.volume import change_entry, change_moments, gather_volume
+from streamfeat.kernels.update import finish
+from streamfeat.kernels.volume import change_entries, change_moments, gather_volume
 
 SLICE = 96
 """Columns that one event may add for the sake of the next bin."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def change_volume(
-    plane: int,
-    volume: int,
-    entry: int,
-    before: int,
-    after: int,
-    shape: tuple[int, int],
-    operator: Operator,
-    state: State,
+    plane: int, volume: int, entry: int, change: int, shape: tuple[int, int], operator: Operator, state: State
 ) -> None:
-    """Let one entry of one volume change, and its code and the pooled sums with it.
+    """Let one entry of a volume change, whatever its code is; its part in the pooled sums follows if coded.
 
     Args:
         plane: of the volume.
         volume: which.
         entry: index into the volume.
-        before: clipped count that the plane stands for; `state.values` holds the whole volume where the
-            operator has a quadratic form.
-        after: clipped count that it shall stand for, one more or one less.
+        change: of its clipped count, 1 or -1.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
-        state: the plane and scratch are changed.
+        state: the plane and scratch are changed; `values[0]` holds the entries before the change, all of
+            them where the operator has a quadratic form.
     """
-    projection, moments = state.projections[plane, volume], state.moments[plane, volume]
-    squares = moments[MOMENT_SQUARES]
-    emptied = squares + after * after == before * before
-    if operator.inverse or operator.kind == TRIANGLE or squares == 0 or emptied:
-        pool_volume(plane, volume, volume, TAKE, shape, operator, state)
-        change_entry(entry, before, after, state.values, operator, projection, moments)
-        pool_volume(plane, volume, volume, ADD, shape, operator, state)
-        return
-    entries = operator.columns.shape[0]
-    sigma = deviation(moments, entries, operator.eps)
-    change_moments(before, after, moments)
-    move_code(
-        after - before,
-        operator.columns[entry],
-        projection,
-        sigma,
-        deviation(moments, entries, operator.eps),
+    part = np.int64(0)
+    coded = volume < state.cursors[plane, CURSOR_CODED]
+    if coded:
+        pool_volume(plane, volume, volume, TAKE, part, shape, operator, state)
+    state.entries[part, 0] = entry
+    state.changes[part, 0] = change
+    change_entries(
+        np.int64(1),
+        state.entries[part],
+        state.changes[part],
+        state.values[part],
         operator,
-        state.pooled[plane, quadrant(volume, shape)],
+        state.projections[plane, volume],
+        state.moments[plane, volume],
     )
-    state.tally[TALLY_ENCODED] += 1
+    if coded:
+        pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def change_place(place: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
@@ -93,33 +85,58 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
     row, column = place // width % height, place % width
     first_row, last_row = covering(row, shape[0], operator)
     first_column, last_column = covering(column, shape[1], operator)
+    fused = not operator.inverse and operator.kind != TRIANGLE
     for plane in range(state.cursors.shape[0]):
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
         # The oldest bin of the window is at position 0 of a volume.
         position = (place // (height * width) - now - 1) % n_bins - ahead
         if position < 0:
             continue
+        coded, projected = state.cursors[plane, CURSOR_CODED], state.cursors[plane, CURSOR_PROJECTED]
+        last_entry = state.cursors[plane, CURSOR_ENTRY]
         for r in range(first_row, last_row):
             for c in range(first_column, last_column):
                 volume = r * shape[1] + c
-                if volume >= state.cursors[plane]:
-                    continue
                 top, left = r * operator.stride, c * operator.stride
-                if operator.quadratic.shape[0]:
-                    first_slot = (now + 1 + ahead) % n_bins
-                    gather_volume(state.applied, first_slot, n_bins - ahead, top, left, patch, state.values)
                 entry = (position * patch + row - top) * patch + column - left
-                change_volume(plane, volume, entry, before, after, shape, operator, state)
+                if volume > projected or (volume == projected and entry >= last_entry):
+                    continue
+                moments = state.moments[plane, volume]
+                squares = moments[MOMENT_SQUARES]
+                if fused and volume < coded and squares and squares + after * after > before * before:
+                    entries = operator.columns.shape[0]
+                    sigma = deviation(moments, entries, operator.eps)
+                    change_moments(before, after, moments)
+                    move_code(
+                        after - before,
+                        operator.columns[entry],
+                        state.projections[plane, volume],
+                        sigma,
+                        deviation(moments, entries, operator.eps),
+                        operator,
+                        state.pooled[plane, quadrant(volume, shape)],
+                    )
+                    state.encoded[0] += 1
+                    continue
+                if operator.quadratic.shape[0]:
+                    end = (n_bins - ahead) * patch * patch
+                    if volume == projected:
+                        end = last_entry
+                    first_slot = (now + 1 + ahead) % n_bins
+                    gather_volume(state.applied, first_slot, end, top, left, patch, state.values[0])
+                state.values[0, entry] = before
+                change_volume(plane, volume, entry, after - before, shape, operator, state)
     applied[place] = after
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def follow(
     events: Events, height: int, width: int, shape: tuple[int, int], operator: Operator, state: State
 ) -> None:
     """Count events one by one, and keep the current plane that of the counts after each.
 
-    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event.
+    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event:
+    projections in the first three quarters of the bin, codes in the next eighth.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
@@ -129,13 +146,19 @@ def follow(
         operator: the encoder.
         state: all of it may be changed. Nothing may be on the touched stack.
     """
+    n_volumes, bin_us = shape[0] * shape[1], operator.bin_us
     for i in range(events.shape[0]):
         event = events[i]
         place = count_event(event.x, event.y, event.p, event.t, height, width, operator, state)
-        complete(shape, operator, state)
+        if state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED] < n_volumes:
+            for part in range(PARTS):
+                complete(part, shape, operator, state)
+            finish(shape, state)
         if place != UNCHANGED:
             change_place(place, shape, operator, state)
-        start = state.clock[CLOCK_START]
-        elapsed = min(max(event.t, start), start + operator.bin_us) - start  # any time: no overflow
-        goal = shape[0] * shape[1] * elapsed * 5 // (4 * operator.bin_us)
-        look_ahead(goal, SLICE, shape, operator, state)
+        if state.cursors.shape[0] > 1:
+            start = state.clock[CLOCK_START]
+            elapsed = min(max(event.t, start), start + bin_us) - start  # any time: no overflow
+            projected = min(n_volumes, n_volumes * elapsed * 4 // (3 * bin_us))
+            coded = n_volumes * max(8 * elapsed - 6 * bin_us, 0) // bin_us
+            look_ahead(projected, coded, np.int64(SLICE), shape, operator, state)

@@ -7,9 +7,10 @@ Every event is checked before it indexes anything: a batch from a hostile source
 as rejected. The check is inside the loop because it costs less there than a vectorised pass before it.
 """
 
-from numba import njit
+import numpy as np
 
 from streamfeat.events import Events
+from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
@@ -30,7 +31,7 @@ UNCHANGED = -1
 """Instead of a place: no clipped count changed."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance_to_bin(new: int, operator: Operator, state: State) -> None:
     """Make `new` the current bin: the slots of bins that leave the window are cleared for reuse.
 
@@ -57,7 +58,7 @@ def advance_to_bin(new: int, operator: Operator, state: State) -> None:
     clock[CLOCK_PLANE] = next_plane
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def count_event(
     x: int, y: int, p: int, t: int, height: int, width: int, operator: Operator, state: State
 ) -> int:
@@ -90,7 +91,10 @@ def count_event(
             tally[TALLY_LATE] += 1
             return UNCHANGED
     tally[TALLY_EVENTS] += 1
-    slot, row, column = bin_index % n_bins, y // operator.downsample, x // operator.downsample
+    slot = bin_index % n_bins
+    # In 32 bits without a sign, where a division takes a third of the time.
+    row = np.int64(np.uint32(y) // np.uint32(operator.downsample))
+    column = np.int64(np.uint32(x) // np.uint32(operator.downsample))
     before = counts[slot, row, column]
     after = before + 2 * p - 1
     counts[slot, row, column] = after
@@ -100,7 +104,7 @@ def count_event(
     return (slot * counts.shape[1] + row) * counts.shape[2] + column
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count_events(events: Events, height: int, width: int, operator: Operator, state: State) -> None:
     """Count every event of a batch, and note the entries that changed for the next reading.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from streamfeat.kernels.compiled import kernel
 from streamfeat.kernels.layout import Operator
 
 MAX_ROUNDS = 20_000
@@ -24,7 +25,7 @@ SWEEPS = 3
 """Sweeps over the active set in one round: about as dear as the look at the gap that they save."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def duality_gap(
     residual: NDArray[np.float64],
     right: NDArray[np.float64],
@@ -53,7 +54,7 @@ def duality_gap(
     return 0.5 * (1.0 + shrink * shrink) * remainder + penalty * l1 - shrink * (remainder + cross)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_lasso(
     right: NDArray[np.float64],
     square: float,
@@ -106,7 +107,7 @@ def solve_lasso(
     return reached
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def subtract_row(step: float, row: NDArray[np.float32], residual: NDArray[np.float64]) -> None:
     """Let one atom move by `step`: `residual -= step * row`, all of it, in one run over memory.
 
@@ -116,7 +117,7 @@ def subtract_row(step: float, row: NDArray[np.float32], residual: NDArray[np.flo
         residual[k] -= step * row[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def descend(
     active: NDArray[np.int64],
     penalty: float,
@@ -142,7 +143,7 @@ def descend(
             subtract_row(step, gram[j], residual)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lasso_code(
     projection: NDArray[np.int32],
     sigma: float,
@@ -174,7 +175,7 @@ def lasso_code(
         atoms[k] = np.float32(solution[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fix_atoms(atoms: NDArray[np.float32], operator: Operator, code: NDArray[np.int32]) -> None:
     """Write a lasso code in fixed point; clipped at `|x|^2 / (2 lambda0)`, which no solution exceeds."""
     unit = operator.unit

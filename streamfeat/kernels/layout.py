@@ -70,8 +70,11 @@ class State(NamedTuple):
     A plane is the state of all volumes at one bin: projections, moments, lasso codes, pooled sums. The
     plane of the current bin is what is read. A second plane, if there is one, looks ahead: it holds what
     volumes will be after the next bin boundary, so that the boundary only swaps the two. Volumes enter a
-    plane in order, and those below its cursor are in it. Invariant: a row whose sum of squares is zero
-    has moments and projection zero.
+    plane in order, first their projections, then their codes; `cursors` says how far it has come. Invariant:
+    a row whose sum of squares is zero has moments and projection zero.
+
+    Two parts of the grid share no pooled sum, so two threads can work on one each: what is scratch is there
+    once for each of the two `PARTS`.
     """
 
     counts: NDArray[np.int32]
@@ -82,12 +85,16 @@ class State(NamedTuple):
     """`(T * H * W,)`: flat indices of the entries whose clipped count changed since; a stack."""
     is_touched: NDArray[np.uint8]
     """`(T, H, W)`: whether an entry is on that stack."""
+    touched_slots: NDArray[np.uint8]
+    """`(T,)`: scratch, slots in which an entry is on that stack."""
     clock: NDArray[np.int64]
-    """`(5,)`: see the CLOCK_* slots."""
+    """`(6,)`: see the CLOCK_* slots."""
     cursors: NDArray[np.int64]
-    """`(planes,)`: volumes below it have entered the plane."""
+    """`(planes, 3)`: see the CURSOR_* slots."""
     tally: NDArray[np.int64]
-    """`(6,)`: see the TALLY_* slots."""
+    """`(5,)`: see the TALLY_* slots."""
+    encoded: NDArray[np.int64]
+    """`(PARTS,)`: volumes encoded so far, a measure of the work done."""
     projections: NDArray[np.int32]
     """`(planes, V, Kp)`: `q` of every volume."""
     moments: NDArray[np.int64]
@@ -95,27 +102,40 @@ class State(NamedTuple):
     atoms: NDArray[np.float32]
     """`(planes, V, K)`: the last lasso code of every volume, from which the next is started."""
     pooled: NDArray[np.int32]
-    """`(planes, 4, F)`: fixed-point codes summed over each quadrant; `F` is Kp, or 2 Kp for SPLIT."""
+    """`(planes, 4, F)`: fixed-point codes summed over each quadrant. `F` is Kp, or 2 Kp for SPLIT: sums of
+    codes, then of their absolute values (the positive and negative parts are half the sum and difference)."""
     dirty: NDArray[np.int32]
     """`(planes * V,)`: volumes to encode again, by `plane * V + volume`; a stack."""
     is_dirty: NDArray[np.uint8]
     """`(planes * V,)`: whether a volume is on that stack."""
     code: NDArray[np.int32]
-    """`(Kp,)`: scratch, the fixed-point code of one volume."""
+    """`(PARTS, Kp)`: scratch, the fixed-point code of one volume."""
     work: NDArray[np.float64]
-    """`(4, Kp)`: scratch of the lasso."""
+    """`(PARTS, 4, Kp)`: scratch of the lasso."""
     active: NDArray[np.int64]
-    """`(Kp,)`: scratch of the lasso, indices of atoms."""
+    """`(PARTS, Kp)`: scratch of the lasso, indices of atoms."""
     values: NDArray[np.int16]
-    """`(d,)`: scratch, the entries of one volume."""
+    """`(PARTS, d)`: scratch, the entries of one volume."""
+    entries: NDArray[np.int32]
+    """`(PARTS, d)`: scratch, the entries of one volume that change."""
+    changes: NDArray[np.int16]
+    """`(PARTS, d)`: scratch, by how much they change."""
 
 
-CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE = range(5)
-"""Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane."""
+PARTS = 2
+"""The upper and the lower half of the grid of volumes."""
 
-TALLY_EVENTS, TALLY_LATE, TALLY_REJECTED, TALLY_SATURATED, TALLY_ROLLS, TALLY_ENCODED = range(6)
+CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE, CLOCK_DIRTY = range(6)
+"""Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane; height
+of the dirty stack."""
+
+CURSOR_CODED, CURSOR_PROJECTED, CURSOR_ENTRY = range(3)
+"""Volumes below the first have a code in the plane, those below the second a projection; of the volume at the
+second, the entries below the third are in its projection."""
+
+TALLY_EVENTS, TALLY_LATE, TALLY_REJECTED, TALLY_SATURATED, TALLY_ROLLS = range(5)
 """Accepted; older than the window; outside the sensor or malformed; no change of a clipped count; bins
-moved on by; volumes encoded."""
+moved on by."""
 
 MOMENT_SUM, MOMENT_SQUARES, MOMENT_QUADRATIC, MOMENT_LINEAR = range(4)
 

@@ -6,67 +6,118 @@ Not here: changes of volumes that are in a plane (`update`, `follow`), and the s
 A bin boundary moves every entry of every volume by one bin, so all that is not empty must be projected
 again. Done when somebody next reads, that is the longest wait of the whole system. Looking ahead spreads
 it over the bin before: what volumes will be after the boundary is prepared beside what they are now.
+A volume enters in two steps. Once it is projected an event costs it one more column; only once it is coded
+does it cost a second code, so codes come last, shortly before the boundary.
 """
 
 import numpy as np
-from numba import njit
 
-from streamfeat.kernels.encode import ADD, pool_volume
-from streamfeat.kernels.layout import CLOCK_NOW, CLOCK_PLANE, MOMENT_SQUARES, Operator, State
-from streamfeat.kernels.volume import gather_volume, project_volume
+from streamfeat.kernels.compiled import kernel
+from streamfeat.kernels.encode import ADD, lower_half, pool_volume
+from streamfeat.kernels.layout import (
+    CLOCK_NOW,
+    CLOCK_PLANE,
+    CURSOR_CODED,
+    CURSOR_ENTRY,
+    CURSOR_PROJECTED,
+    MOMENT_SQUARES,
+    Operator,
+    State,
+)
+from streamfeat.kernels.volume import change_entries, gather_volume, list_filled
 
 CURRENT, NEXT = np.int64(0), np.int64(1)
 """Bins by which a plane is ahead."""
 
+CODE_COST = 6
+"""Columns that could be added while one volume is encoded and pooled."""
 
-@njit(cache=True, nogil=True)
-def enter_volume(plane: int, ahead: int, shape: tuple[int, int], operator: Operator, state: State) -> int:
-    """Let the next volume enter a plane: project it from nothing, encode it, pool it.
+
+@kernel
+def project_volume(
+    plane: int,
+    volume: int,
+    ahead: int,
+    start: int,
+    most: int,
+    part: int,
+    shape: tuple[int, int],
+    operator: Operator,
+    state: State,
+) -> tuple[int, int]:
+    """Let entries of a volume into its projection in a plane, in order.
 
     Args:
-        plane: which plane; its cursor moves on.
+        plane: which plane.
+        volume: which volume. Where the plane has a single row, volumes share it.
         ahead: CURRENT for the current bin, NEXT for the bin after it.
+        start: first entry that is not in yet; from 0 on, what the row held before is cleared.
+        most: entries that are not zero to let in at most.
+        part: whose scratch to use.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
-        state: the plane and scratch are changed. Where it has a single row, volumes share it.
+        state: the row and scratch are changed.
 
     Returns:
-        how many entries of the volume are not zero.
+        how many entries that are not zero were let in, and the entry to go on from.
     """
-    volume = state.cursors[plane]
-    state.cursors[plane] += 1
     row = min(volume, state.projections.shape[1] - 1)
     projection, moments = state.projections[plane, row], state.moments[plane, row]
-    n_bins = state.applied.shape[0]
+    values, entries, changes = state.values[part], state.entries[part], state.changes[part]
+    if start == 0 and moments[MOMENT_SQUARES] != 0:
+        projection[:] = 0
+        moments[:] = 0
+    n_bins, patch = state.applied.shape[0], operator.patch
+    end = (n_bins - ahead) * patch * patch
     top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
     first_slot = (state.clock[CLOCK_NOW] + 1 + ahead) % n_bins
-    filled = gather_volume(state.applied, first_slot, n_bins - ahead, top, left, operator.patch, state.values)
-    if filled == 0:
-        if moments[MOMENT_SQUARES] != 0:
-            projection[:] = 0
-            moments[:] = 0
-            state.atoms[plane, row] = 0
-        return 0
-    project_volume(state.values, operator, projection, moments)
-    pool_volume(plane, row, volume, ADD, shape, operator, state)
-    return filled
+    n, following = list_filled(
+        state.applied, first_slot, start, end, most, top, left, patch, entries, changes
+    )
+    if operator.quadratic.shape[0]:
+        gather_volume(state.applied, first_slot, start, top, left, patch, values)
+    else:
+        for i in range(n):
+            values[entries[i]] = 0
+    change_entries(n, entries, changes, values, operator, projection, moments)
+    return n, following
 
 
-@njit(cache=True, nogil=True)
-def complete(shape: tuple[int, int], operator: Operator, state: State) -> None:
-    """Let all volumes that are missing enter the current plane."""
-    plane = state.clock[CLOCK_PLANE]
-    while state.cursors[plane] < shape[0] * shape[1]:
-        enter_volume(plane, CURRENT, shape, operator, state)
-
-
-@njit(cache=True, nogil=True)
-def look_ahead(goal: int, budget: int, shape: tuple[int, int], operator: Operator, state: State) -> int:
-    """Let volumes enter the plane that looks ahead, until `goal` are in it or the budget is spent.
+@kernel
+def complete(part: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
+    """Let all volumes of one part of the grid that are missing enter the current plane.
 
     Args:
-        goal: volumes that shall be in the plane.
-        budget: columns that may be added; encoding a volume counts for four.
+        part: 0 for the upper half, 1 for the lower. The cursors stay, for the other part to see.
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: the plane and scratch of the part are changed.
+    """
+    plane = state.clock[CLOCK_PLANE]
+    cursors, half = state.cursors[plane], lower_half(shape)
+    first, last = (0, half) if part == 0 else (half, shape[0] * shape[1])
+    for volume in range(max(first, cursors[CURSOR_CODED]), last):
+        row = min(volume, state.projections.shape[1] - 1)
+        if volume >= cursors[CURSOR_PROJECTED]:
+            start = cursors[CURSOR_ENTRY] if volume == cursors[CURSOR_PROJECTED] else np.int64(0)
+            most = state.values.shape[1]
+            project_volume(plane, volume, CURRENT, start, most, part, shape, operator, state)
+        if state.moments[plane, row, MOMENT_SQUARES] != 0:
+            pool_volume(plane, row, volume, ADD, part, shape, operator, state)
+        else:
+            state.atoms[plane, row] = 0
+
+
+@kernel
+def look_ahead(
+    projected: int, coded: int, budget: int, shape: tuple[int, int], operator: Operator, state: State
+) -> int:
+    """Let volumes enter the plane that looks ahead, as far as asked or until the budget is spent.
+
+    Args:
+        projected: volumes that shall have a projection.
+        coded: volumes that shall have a code.
+        budget: columns that may be added; encoding a volume counts for `CODE_COST`.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: the other plane and scratch are changed; nothing happens if there is one plane only, or the
@@ -75,19 +126,29 @@ def look_ahead(goal: int, budget: int, shape: tuple[int, int], operator: Operato
     Returns:
         what is left of the budget.
     """
-    current = state.clock[CLOCK_PLANE]
-    volumes = shape[0] * shape[1]
-    if state.cursors.shape[0] == 1 or state.cursors[current] < volumes:
+    current, volumes = state.clock[CLOCK_PLANE], shape[0] * shape[1]
+    if state.cursors.shape[0] == 1 or state.cursors[current, CURSOR_CODED] < volumes:
         return budget
     plane = 1 - current
-    while budget > 0 and state.cursors[plane] < min(goal, volumes):
-        volume = state.cursors[plane]
-        if (
-            state.moments[current, volume, MOMENT_SQUARES]
-            == 0
-            == state.moments[plane, volume, MOMENT_SQUARES]
-        ):
-            state.cursors[plane] += 1  # what is empty now will be empty then
+    cursors, moments, part = state.cursors[plane], state.moments[plane], np.int64(0)
+    while budget > 0 and cursors[CURSOR_PROJECTED] < projected:
+        volume, start = cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY]
+        end = operator.columns.shape[0]
+        # What is empty now will be empty then.
+        if start > 0 or state.moments[current, volume, MOMENT_SQUARES] or moments[volume, MOMENT_SQUARES]:
+            n, start = project_volume(plane, volume, NEXT, start, budget, part, shape, operator, state)
+            budget -= 1 + n
+            end -= operator.patch * operator.patch
         else:
-            budget -= 4 + enter_volume(plane, NEXT, shape, operator, state)
+            start = end
+        cursors[CURSOR_PROJECTED] += start == end
+        cursors[CURSOR_ENTRY] = 0 if start == end else start
+    while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
+        volume = cursors[CURSOR_CODED]
+        if moments[volume, MOMENT_SQUARES] != 0:
+            pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
+            budget -= CODE_COST
+        else:
+            state.atoms[plane, volume] = 0
+        cursors[CURSOR_CODED] += 1
     return budget

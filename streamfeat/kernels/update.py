@@ -3,78 +3,147 @@
 Lives here: applying what has changed since the last reading. Each entry costs its net change only, and
 each changed volume is encoded once, however many events fell on it.
 Not here: what a volume's sums are (`volume`), what its code is (`encode`), single events (`follow`).
+
+In four steps, because two of them can be done for both parts of the grid at once, by two threads:
+`mark_dirty`, `renew` each part, `settle`, `complete` each part.
 """
 
 import numpy as np
-from numba import njit
 
-from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume
-from streamfeat.kernels.layout import CLOCK_NOW, CLOCK_PLANE, CLOCK_TOUCHED, Operator, State
+from streamfeat.kernels.compiled import kernel
+from streamfeat.kernels.encode import ADD, TAKE, covering, lower_half, pool_volume
+from streamfeat.kernels.layout import (
+    CLOCK_DIRTY,
+    CLOCK_NOW,
+    CLOCK_PLANE,
+    CLOCK_TOUCHED,
+    CURSOR_CODED,
+    CURSOR_ENTRY,
+    CURSOR_PROJECTED,
+    PARTS,
+    Operator,
+    State,
+)
 from streamfeat.kernels.planes import complete
-from streamfeat.kernels.volume import change_entry, gather_volume
+from streamfeat.kernels.volume import change_entries, gather_volume, list_changed
 
 
-@njit(cache=True, nogil=True)
-def apply_touched(shape: tuple[int, int], operator: Operator, state: State) -> None:
-    """Apply the net change of every touched entry to all planes; encode each changed volume once."""
+@kernel
+def mark_dirty(shape: tuple[int, int], operator: Operator, state: State) -> None:
+    """Put every volume of every plane that covers a touched entry on the dirty stack.
+
+    Args:
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: `dirty`, `is_dirty`, `touched_slots` and the height of the dirty stack are changed.
+    """
     n_bins, height, width = state.counts.shape
-    flags, applied, counts = state.is_touched.reshape(-1), state.applied.reshape(-1), state.counts.reshape(-1)
-    limit = operator.max_count
+    applied, counts, limit = state.applied.reshape(-1), state.counts.reshape(-1), operator.max_count
     n_volumes, patch, now = shape[0] * shape[1], operator.patch, state.clock[CLOCK_NOW]
+    state.touched_slots[:] = 0
     n_dirty = 0
     for i in range(state.clock[CLOCK_TOUCHED]):
         place = state.touched[i]
-        flags[place] = 0
-        before = np.int64(applied[place])
-        after = min(max(np.int64(counts[place]), -limit), limit)
-        if before == after:
+        if applied[place] == min(max(counts[place], -limit), limit):
             continue
+        slot = place // (height * width)
+        state.touched_slots[slot] = 1
         row, column = place // width % height, place % width
         first_row, last_row = covering(row, shape[0], operator)
         first_column, last_column = covering(column, shape[1], operator)
         for plane in range(state.cursors.shape[0]):
-            ahead = np.int64(plane != state.clock[CLOCK_PLANE])
             # The oldest bin of the window is at position 0 of a volume.
-            position = (place // (height * width) - now - 1) % n_bins - ahead
+            position = (slot - now - 1) % n_bins - np.int64(plane != state.clock[CLOCK_PLANE])
+            last, last_entry = state.cursors[plane, CURSOR_PROJECTED], state.cursors[plane, CURSOR_ENTRY]
             if position < 0:
                 continue
             for r in range(first_row, last_row):
                 for c in range(first_column, last_column):
                     volume = r * shape[1] + c
-                    if volume >= state.cursors[plane]:
-                        continue
                     index = plane * n_volumes + volume
-                    if state.is_dirty[index] == 0:
+                    top, left = r * operator.stride, c * operator.stride
+                    entry = (position * patch + row - top) * patch + column - left
+                    inside = volume < last or (volume == last and entry < last_entry)
+                    if inside and state.is_dirty[index] == 0:
                         state.is_dirty[index] = 1
                         state.dirty[n_dirty] = index
                         n_dirty += 1
-                        pool_volume(plane, volume, volume, TAKE, shape, operator, state)
-                    top, left = r * operator.stride, c * operator.stride
-                    if operator.quadratic.shape[0]:
-                        first_slot = (now + 1 + ahead) % n_bins
-                        gather_volume(
-                            state.applied, first_slot, n_bins - ahead, top, left, patch, state.values
-                        )
-                    entry = (position * patch + row - top) * patch + column - left
-                    change_entry(
-                        entry,
-                        before,
-                        after,
-                        state.values,
-                        operator,
-                        state.projections[plane, volume],
-                        state.moments[plane, volume],
-                    )
-        applied[place] = after
-    for i in range(n_dirty):
+    state.clock[CLOCK_DIRTY] = n_dirty
+
+
+@kernel
+def renew(part: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
+    """Let the dirty volumes of one part of the grid follow the counts.
+
+    Args:
+        part: 0 for the upper half, 1 for the lower.
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: rows, pooled sums and scratch of the part are changed.
+    """
+    n_bins, patch, n_volumes = state.counts.shape[0], operator.patch, shape[0] * shape[1]
+    values, entries, changes = state.values[part], state.entries[part], state.changes[part]
+    for i in range(state.clock[CLOCK_DIRTY]):
         index = np.int64(state.dirty[i])
-        state.is_dirty[index] = 0
-        volume = index % n_volumes
-        pool_volume(index // n_volumes, volume, volume, ADD, shape, operator, state)
+        plane, volume = index // n_volumes, index % n_volumes
+        if part != np.int64(volume >= lower_half(shape)):
+            continue
+        cursors = state.cursors[plane]
+        ahead = np.int64(plane != state.clock[CLOCK_PLANE])
+        end = (n_bins - ahead) * patch * patch
+        if volume == cursors[CURSOR_PROJECTED]:
+            end = cursors[CURSOR_ENTRY]
+        top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
+        first_slot = (state.clock[CLOCK_NOW] + 1 + ahead) % n_bins
+        if operator.quadratic.shape[0]:
+            gather_volume(state.applied, first_slot, end, top, left, patch, values)
+        n = list_changed(
+            state.counts,
+            state.applied,
+            operator.max_count,
+            state.touched_slots,
+            first_slot,
+            end,
+            top,
+            left,
+            patch,
+            entries,
+            changes,
+            values,
+        )
+        coded = volume < cursors[CURSOR_CODED]
+        if coded:
+            pool_volume(plane, volume, volume, TAKE, part, shape, operator, state)
+        projection, moments = state.projections[plane, volume], state.moments[plane, volume]
+        change_entries(n, entries, changes, values, operator, projection, moments)
+        if coded:
+            pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
+
+
+@kernel
+def settle(operator: Operator, state: State) -> None:
+    """The planes stand for the counts as they are now: both stacks are empty."""
+    flags, applied, counts = state.is_touched.reshape(-1), state.applied.reshape(-1), state.counts.reshape(-1)
+    for i in range(state.clock[CLOCK_TOUCHED]):
+        place = state.touched[i]
+        flags[place] = 0
+        applied[place] = min(max(counts[place], -operator.max_count), operator.max_count)
+    for i in range(state.clock[CLOCK_DIRTY]):
+        state.is_dirty[state.dirty[i]] = 0
     state.clock[CLOCK_TOUCHED] = 0
+    state.clock[CLOCK_DIRTY] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
+def finish(shape: tuple[int, int], state: State) -> None:
+    """Both parts of the current plane are complete."""
+    cursors = state.cursors[state.clock[CLOCK_PLANE]]
+    cursors[CURSOR_CODED] = shape[0] * shape[1]
+    cursors[CURSOR_PROJECTED] = shape[0] * shape[1]
+    cursors[CURSOR_ENTRY] = 0
+
+
+@kernel
 def update(shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Make the current plane that of the counts.
 
@@ -83,5 +152,10 @@ def update(shape: tuple[int, int], operator: Operator, state: State) -> None:
         operator: the encoder.
         state: all of it may be changed.
     """
-    apply_touched(shape, operator, state)
-    complete(shape, operator, state)
+    mark_dirty(shape, operator, state)
+    for part in range(PARTS):
+        renew(part, shape, operator, state)
+    settle(operator, state)
+    for part in range(PARTS):
+        complete(part, shape, operator, state)
+    finish(shape, state)
