@@ -1,7 +1,6 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
 import math
-from fractions import Fraction
 
 import numpy as np
 
@@ -547,11 +546,14 @@ def follow(events, height, width, shape, operator, state):
             finish(shape, state)
         if place >= 0:
             change_place(place, shape, operator, state)
-        part_of_bin = Fraction(event[3] - int(state.clock[CLOCK_START]), operator.bin_us)
-        part_of_bin = min(max(part_of_bin, 0), 1)
-        projected = math.floor(n_volumes * min(part_of_bin * Fraction(4, 3), 1))
-        coded = math.floor(n_volumes * max(8 * part_of_bin - 6, 0))
-        look_ahead(projected, coded, 96, shape, operator, state)
+        if len(state.cursors) == 2:
+            share = float(np.clip((event[3] - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
+            goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])
+            coded, projected = (int(goal) for goal in np.minimum(n_volumes, n_volumes * goals)[::-1])
+            coming = state.cursors[1 - int(state.clock[CLOCK_PLANE])]
+            behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
+            budget = 24 + 100 * int(behind) // n_volumes
+            look_ahead(projected, coded, budget, shape, operator, state)
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

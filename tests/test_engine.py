@@ -460,21 +460,21 @@ def test_events_after_preparing_are_in_what_was_prepared(kind):
         assert_certified(engine._operator, engine._state)
 
 
-def test_following_prepares_the_boundary_within_seven_eighths_of_the_bin():
+def test_following_prepares_the_boundary_shortly_before_it():
     case = known_case()
     engine, _, boundary = a_full_window(case)
     engine.features()
     bin_us, volumes = case.geometry.bin_us, engine.grid_shape[0] * engine.grid_shape[1]
     start, last = boundary - bin_us, np.zeros(3, int)
-    for t in range(start, start + bin_us * 7 // 8, 4):
-        engine.follow(make_events([5], [5], [t // 4 % 2], [t]))
+    for t in range(start, start + bin_us * 39 // 40, 2):
+        engine.follow(make_events([5], [5], [t // 2 % 2], [t]))
         coming = engine._state.cursors[1 - engine._state.clock[CLOCK_PLANE]].copy()
         assert (coming[:CURSOR_ENTRY] - last[:CURSOR_ENTRY]).max() <= 5  # spread out
         elapsed = (t - start + 1) / bin_us
-        assert coming[CURSOR_PROJECTED] <= volumes * elapsed * 4 / 3
-        assert coming[CURSOR_CODED] <= volumes * max(8 * elapsed - 6, 0)
+        assert coming[CURSOR_PROJECTED] <= volumes * elapsed / 0.9
+        assert coming[CURSOR_CODED] <= volumes * max(8 * elapsed - 6.8, 0)
         last = coming
-    engine.follow(make_events([5], [5], [1], [start + bin_us * 7 // 8]))
+    engine.follow(make_events([5], [5], [1], [start + bin_us * 39 // 40]))
     assert engine._state.cursors.tolist() == [[volumes, volumes, 0]] * 2
     assert engine.prepare(1)
 

@@ -28,8 +28,12 @@ from streamfeat.kernels.planes import complete, look_ahead
 from streamfeat.kernels.update import finish
 from streamfeat.kernels.volume import change_entries, change_moments, gather_volume
 
-SLICE = 96
-"""Columns that one event may add for the sake of the next bin."""
+PROJECTED_BY, CODED_FROM, CODED_BY = 0.9, 0.85, 0.975
+"""Shares of a bin: when all projections of the next bin shall be there, and between when all codes."""
+
+SLICE, HASTE = 24, 100
+"""Columns that one event may add for the sake of the next bin: always, and for each grid of volumes that the
+next bin is behind its pace."""
 
 
 @kernel
@@ -135,8 +139,7 @@ def follow(
 ) -> None:
     """Count events one by one, and keep the current plane that of the counts after each.
 
-    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event:
-    projections in the first three quarters of the bin, codes in the next eighth.
+    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
@@ -157,8 +160,10 @@ def follow(
         if place != UNCHANGED:
             change_place(place, shape, operator, state)
         if state.cursors.shape[0] > 1:
-            start = state.clock[CLOCK_START]
-            elapsed = min(max(event.t, start), start + bin_us) - start  # any time: no overflow
-            projected = min(n_volumes, n_volumes * elapsed * 4 // (3 * bin_us))
-            coded = n_volumes * max(8 * elapsed - 6 * bin_us, 0) // bin_us
-            look_ahead(projected, coded, np.int64(SLICE), shape, operator, state)
+            share = min(max((event.t - state.clock[CLOCK_START]) / bin_us, 0.0), 1.0)
+            projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
+            coded = min(n_volumes, int(n_volumes * max(share - CODED_FROM, 0.0) / (CODED_BY - CODED_FROM)))
+            coming = state.cursors[1 - state.clock[CLOCK_PLANE]]
+            behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
+            budget = SLICE + HASTE * behind // n_volumes
+            look_ahead(projected, coded, budget, shape, operator, state)
