@@ -37,10 +37,17 @@ def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
     Returns:
         same shape; all zero where the features are.
     """
+    roots, length = _roots(features)
+    return np.asarray(roots / length, np.float32)
+
+
+def _roots(features: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Signed square roots, and the length of each row of them; one where a row is zero."""
     size = np.abs(features)
     # The squares of the roots add up to the sizes.
     length = np.sqrt(size.sum(axis=-1, keepdims=True))
-    return np.asarray(np.copysign(np.sqrt(size), features) / np.where(length > 0, length, 1), np.float32)
+    np.sqrt(size, out=size)
+    return np.copysign(size, features, out=size), np.where(length > 0, length, np.float32(1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +71,14 @@ class Classifier:
     bias: NDArray[np.float32]
     fingerprint: str
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    _folded: NDArray[np.float32] = field(init=False, repr=False, compare=False)
+    _folded_bias: NDArray[np.float32] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Fold standardisation into the weights."""
+        folded = self.weights / self.scale[:, np.newaxis]
+        object.__setattr__(self, "_folded", folded)
+        object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
 
     @classmethod
     def untrained(cls, labels: Sequence[str], encoder: Encoder) -> Self:
@@ -91,7 +106,12 @@ class Classifier:
 
     def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """Score of every label: `(C,)` for features `(F,)`, `(n, C)` for `(n, F)`."""
-        return _spread(self.prepare(features) @ self.weights + self.bias)
+        # As `prepare(features) @ weights + bias`, with all that does not depend on the features worked out.
+        roots, length = _roots(features)
+        # Row by row: a product of matrices would have other last bits for another number of rows.
+        products = [row @ self._folded for row in roots.reshape(-1, roots.shape[-1])]
+        totals = np.reshape(products, (*features.shape[:-1], len(self.bias)))
+        return _spread(totals / length + self._folded_bias)
 
     def predict(self, features: NDArray[np.float32]) -> str:
         """The label with the highest score for features `(F,)`."""

@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import (
-    ENCODINGS,
-    SPLIT,
-    Operator,
-)
-from streamfeat.operator import check_operator, fixed_fields, quantise
+from streamfeat.kernels.layout import ENCODINGS, Operator
+from streamfeat.operator import check_operator, fixed_fields, n_features, quantise
 from streamfeat.safe_arrays import one_line, read_safetensors, write_safetensors
 from streamfeat.window import encode_window
 
@@ -145,7 +141,7 @@ class Encoder:
     @property
     def n_features(self) -> int:
         """Length of a feature vector: `4 K`, or `8 K` for `split`."""
-        return 4 * self.n_filters * (2 if self.operator.kind == SPLIT else 1)
+        return n_features(self.operator)
 
     def encode(
         self,

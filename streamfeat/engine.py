@@ -17,7 +17,7 @@ from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.kernels.encode import encode_volume
-from streamfeat.kernels.follow import follow
+from streamfeat.kernels.follow import follow, trace
 from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
@@ -31,9 +31,9 @@ from streamfeat.kernels.layout import (
     TALLY_EVENTS,
 )
 from streamfeat.kernels.planes import look_ahead
-from streamfeat.kernels.update import update
-from streamfeat.operator import with_fixed_point
-from streamfeat.state import allocate_state, read_features
+from streamfeat.kernels.update import read, update
+from streamfeat.operator import n_features, with_fixed_point
+from streamfeat.state import allocate_state
 
 __all__ = ["Engine", "EngineStats", "Snapshot"]
 
@@ -141,6 +141,26 @@ class Engine:
         self._update()
         follow(events, *self.resolution, self.grid_shape, self._operator, self._state)
 
+    def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Feed a batch event by event, and read the features after each.
+
+        Args:
+            batch: as for `feed`, `n` events.
+
+        Returns:
+            features `(n, n_features)` float32, a row after each event, and `(n,)` int64, how many events
+            had been accepted by then.
+
+        Raises:
+            InputError: not an array of EVENT_DTYPE.
+        """
+        events = self._checked(batch)
+        self._update()
+        features = np.empty((len(events), n_features(self._operator)), np.float32)
+        accepted = np.empty(len(events), np.int64)
+        trace(events, *self.resolution, self.grid_shape, self._operator, self._state, features, accepted)
+        return features, accepted
+
     def prepare(self, columns: int) -> bool:
         """Use idle time to look ahead to the next bin boundary.
 
@@ -192,8 +212,9 @@ class Engine:
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        self._update()
-        return read_features(self._operator, self._state)
+        features = np.empty(n_features(self._operator), np.float32)
+        read(self.grid_shape, self._operator, self._state, features)
+        return features
 
     def codes(self) -> NDArray[np.float32]:
         """The code of every local volume, a copy: `(rows, columns, K)` float32, before any split."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.geometry import Geometry
-from streamfeat.kernels.layout import ENCODINGS, LANES, TRIANGLE, Operator
+from streamfeat.kernels.layout import ENCODINGS, LANES, SPLIT, TRIANGLE, Operator
 
-__all__ = ["check_operator", "fixed_fields", "quantise", "with_fixed_point"]
+__all__ = ["check_operator", "fixed_fields", "n_features", "quantise", "with_fixed_point"]
 
 _INT16, _INT32 = 2**15 - 1, 2**31 - 1
 
@@ -203,6 +203,11 @@ def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operato
     offset = operator.offset * np.float32(unit)
     offset.flags.writeable = False
     return operator._replace(unit=unit, offset=offset, threshold=operator.threshold * unit)
+
+
+def n_features(operator: Operator) -> int:
+    """Length of the feature vector: four quadrants of `K` codes, or of `2 K` for `split`."""
+    return 4 * operator.n_filters * (2 if operator.kind == SPLIT else 1)
 
 
 def _fixed_point_bits(operator: Operator, volumes: int) -> int:

@@ -21,7 +21,9 @@ from streamfeat.recording import Label, Packet
 
 __all__ = ["Session", "SessionStats"]
 
-_NO_SCORES = np.zeros(0, np.float32)
+_TRACE = 32
+"""Events whose features are held at a time under `event`."""
+
 _AUTO_REST = 4.0
 """Under `auto`, time that passes after a reading, in multiples of what that reading took."""
 
@@ -166,7 +168,9 @@ class Session:
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         if len(events) == 0:
             return
-        if self.policy.kind == "time":
+        if self._every_event:
+            yield from self._trace(engine, events, latest)
+        elif self.policy.kind == "time":
             yield from self._feed_by_time(engine, events, latest)
         elif self.policy.kind == "events":
             yield from self._feed_by_count(engine, events, latest)
@@ -177,6 +181,34 @@ class Session:
                 yield self._read(engine, self._last_us + 1)
                 spent = self._clock() - now
                 self._rest_until = now + spent * (1 + _AUTO_REST)
+
+    def _trace(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        """One emission an event; some at a time, because that many calls from Python would cost far more."""
+        before = self._stats.events
+        for start in range(0, len(events), _TRACE):
+            traced = slice(start, min(start + _TRACE, len(events)))
+            features, accepted = engine.trace(events[traced])
+            times = latest[traced] + 1
+            self._last_us = max(self._last_us, int(latest[traced][-1]))
+            self._stats.emissions += len(features)
+            labels, scores = self._scores(features)
+            for i in range(len(features)):
+                yield Emission(
+                    t_us=int(times[i]),
+                    n_events=before + int(accepted[i]),
+                    features=features[i],
+                    labels=labels,
+                    scores=scores[i],
+                    sample=self._sample,
+                    final=False,
+                )
+
+    def _scores(self, features: NDArray[np.float32]) -> tuple[tuple[str, ...], NDArray[np.float32]]:
+        """Labels, and the scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
+        classifier = self.classifier
+        if classifier is None:
+            return (), np.zeros((len(features), 0), np.float32)
+        return classifier.labels, classifier.scores(features)
 
     def _feed_by_count(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         start = 0
@@ -216,10 +248,7 @@ class Session:
         return self.encoder.geometry.window_us
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
-        if self._every_event:
-            engine.follow(events)
-        else:
-            engine.feed(events)
+        engine.feed(events)
         self._unread += len(events)
         self._last_us = max(self._last_us, int(latest[-1]))
 
@@ -228,13 +257,13 @@ class Session:
         features = engine.features()
         self._unread = 0
         self._stats.emissions += 1
-        classifier = self.classifier
+        labels, scores = self._scores(features[np.newaxis])
         return Emission(
             t_us=t_us,
             n_events=self._stats.events + engine.n_events,
             features=features,
-            labels=classifier.labels if classifier else (),
-            scores=classifier.scores(features) if classifier else _NO_SCORES,
+            labels=labels,
+            scores=scores[0],
             sample=self._sample,
             final=final,
         )

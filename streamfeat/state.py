@@ -1,11 +1,10 @@
-"""Allocating the state that kernels change, and reading features out of it.
+"""Allocating the state that kernels change.
 
-Lives here: shapes of the arrays in `kernels.layout.State`, and the way from fixed point to float.
+Lives here: shapes of the arrays in `kernels.layout.State`.
 Not here: what an event does to them.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from streamfeat.events import Resolution
 from streamfeat.geometry import Geometry
@@ -13,7 +12,6 @@ from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
-    CLOCK_PLANE,
     CLOCK_START,
     PARTS,
     SPLIT,
@@ -21,7 +19,7 @@ from streamfeat.kernels.layout import (
     State,
 )
 
-__all__ = ["allocate_state", "read_features"]
+__all__ = ["allocate_state"]
 
 
 def allocate_state(
@@ -78,13 +76,3 @@ def allocate_state(
         entries=np.zeros((PARTS, geometry.entries), np.int32),
         changes=np.zeros((PARTS, geometry.entries), np.int16),
     )
-
-
-def read_features(operator: Operator, state: State) -> NDArray[np.float32]:
-    """The pooled sums quadrant by quadrant, without padding: `(4 K,)` float32, or `(8 K,)` for `split`."""
-    pooled = state.pooled[state.clock[CLOCK_PLANE]]
-    parts = pooled.reshape(4, -1, operator.offset.shape[0])[:, :, : operator.n_filters]
-    if operator.kind == SPLIT:
-        signed, absolute = parts[:, 0], parts[:, 1]
-        parts = np.stack([absolute + signed, absolute - signed], axis=1) // 2
-    return np.asarray(parts.reshape(-1) / operator.unit, np.float32)

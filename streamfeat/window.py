@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
+from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, PARTS, Operator
 from streamfeat.kernels.planes import complete
-from streamfeat.operator import with_fixed_point
-from streamfeat.state import allocate_state, read_features
+from streamfeat.operator import n_features, with_fixed_point
+from streamfeat.state import allocate_state
 
 __all__ = ["count_window", "encode_window"]
 
@@ -72,4 +73,6 @@ def encode_window(
     state.clock[CLOCK_NOW] = -1  # the window ends with the last slot
     for part in range(PARTS):
         complete(part, shape, pooling, state)
-    return read_features(pooling, state)
+    features = np.empty(n_features(pooling), np.float32)
+    read_features(pooling, state, features)
+    return features

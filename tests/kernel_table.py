@@ -27,6 +27,7 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
+from streamfeat.operator import n_features
 
 SCRATCH = {"touched", "touched_slots", "dirty", "code", "work", "active", "values", "entries", "changes"}
 """Fields of a State whose content means nothing between two calls."""
@@ -94,6 +95,16 @@ def exact_but_atoms_of_a_part(kernel: Run, twin: Run) -> None:
             naive.complete(1 - part, shape, operator, state)
             naive.finish(shape, state)
     exact_but_atoms(kernel, twin)
+
+
+def exact_but_features(kernel: Run, twin: Run) -> None:
+    """As `exact_but_atoms`, of the arguments before those that are written to; features as the codes are."""
+    at = next(i for i, value in enumerate(kernel.after) if isinstance(value, State)) + 1
+    exact_but_atoms(*(Run(run.before[:at], run.after[:at], None) for run in (kernel, twin)))
+    inverse = kernel.after[at - 2].inverse
+    np.testing.assert_allclose(kernel.after[at], twin.after[at], rtol=0, atol=0.05 if inverse else 0)
+    for mine, yours in zip(kernel.after[at + 1 :], twin.after[at + 1 :], strict=True):
+        assert_same(mine, yours)
 
 
 def in_planes(state):
@@ -532,6 +543,11 @@ def make_update(rng):
     return parts_of(engine)
 
 
+def make_read(rng):
+    *parts, operator, state = make_update(rng)
+    return *parts, operator, state, np.zeros(n_features(operator), np.float32)
+
+
 def engine_with_news(rng):
     """An engine with events since its last reading, some planes of which are as if they were being filled."""
     shape, operator, state = parts_of(read_engine(rng, more=40))
@@ -598,6 +614,24 @@ def make_follow(rng):
     events["t"][near] = np.sort(bin_start(engine) + rng.integers(0, 2 * bin_us + 1, near.sum()))
     shape, operator, state = parts_of(engine)
     return events, *engine.resolution, shape, operator, state
+
+
+def make_follow_event(rng):
+    events, *sensor = make_follow(rng)
+    while len(events) == 0:
+        events, *sensor = make_follow(rng)
+    return *(int(events[name][0]) for name in ("x", "y", "p", "t")), *sensor
+
+
+def make_trace(rng):
+    events, *sensor, operator, state = make_follow(rng)
+    features, accepted = np.zeros((len(events), n_features(operator)), np.float32), np.zeros(len(events), int)
+    return events, *sensor, operator, state, features, accepted
+
+
+def make_read_features(rng):
+    _, operator, state = parts_of(read_engine(rng))
+    return operator, state, np.zeros(n_features(operator), np.float32)
 
 
 def make_add_column(rng):
@@ -709,6 +743,7 @@ KERNELS = [
     Row(encode.covering, make_covering, same_range),
     Row(encode.encode_volume, make_encode_volume),
     Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
+    Row(encode.read_features, make_read_features),
     Row(planes.project_volume, make_project_volume, exact_but_scratch),
     Row(planes.complete, make_complete, exact_but_atoms_of_a_part),
     Row(planes.look_ahead, make_look_ahead, exact_but_atoms),
@@ -717,9 +752,12 @@ KERNELS = [
     Row(update.settle, make_settle),
     Row(update.finish, make_finish),
     Row(update.update, make_update, exact_but_atoms),
+    Row(update.read, make_read, exact_but_features),
     Row(follow.change_volume, make_change_volume, exact_but_scratch),
     Row(follow.change_place, make_change_place, exact_but_atoms),
+    Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
+    Row(follow.trace, make_trace, exact_but_features),
     Row(volume.add_column, make_add_column),
     Row(volume.change_moments, make_change_moments),
     Row(volume.add_columns, make_add_columns),

@@ -378,6 +378,15 @@ def pool_volume(plane, row, volume, sign, part, shape, operator, state):
     state.encoded[part] += sign > 0
 
 
+def read_features(operator, state, features):
+    pooled = state.pooled[int(state.clock[CLOCK_PLANE])].astype(np.int64)
+    parts = pooled.reshape(4, -1, len(operator.offset))[:, :, : operator.n_filters]
+    if operator.kind == SPLIT:
+        signed, absolute = parts[:, 0], parts[:, 1]
+        parts = np.stack([(absolute + signed) / 2, (absolute - signed) / 2], axis=1)
+    features[:] = parts.reshape(-1) / operator.unit
+
+
 # streamfeat.kernels.planes
 
 
@@ -518,6 +527,11 @@ def update(shape, operator, state):
     finish(shape, state)
 
 
+def read(shape, operator, state, features):
+    update(shape, operator, state)
+    read_features(operator, state, features)
+
+
 # streamfeat.kernels.follow
 
 
@@ -537,23 +551,34 @@ def change_place(place, shape, operator, state):
 
 
 def follow(events, height, width, shape, operator, state):
-    n_volumes = shape[0] * shape[1]
     for event in events.tolist():
-        place = count_event(*event, height, width, operator, state)
-        if state.cursors[int(state.clock[CLOCK_PLANE]), CURSOR_CODED] < n_volumes:
-            for part in range(2):
-                complete(part, shape, operator, state)
-            finish(shape, state)
-        if place >= 0:
-            change_place(place, shape, operator, state)
-        if len(state.cursors) == 2:
-            share = float(np.clip((event[3] - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
-            goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])
-            coded, projected = (int(goal) for goal in np.minimum(n_volumes, n_volumes * goals)[::-1])
-            coming = state.cursors[1 - int(state.clock[CLOCK_PLANE])]
-            behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
-            budget = 24 + 100 * int(behind) // n_volumes
-            look_ahead(projected, coded, budget, shape, operator, state)
+        follow_event(*event, height, width, shape, operator, state)
+
+
+def trace(events, height, width, shape, operator, state, features, accepted):
+    for i, event in enumerate(events.tolist()):
+        follow_event(*event, height, width, shape, operator, state)
+        read_features(operator, state, features[i])
+        accepted[i] = state.tally[TALLY_EVENTS]
+
+
+def follow_event(x, y, p, t, height, width, shape, operator, state):
+    n_volumes = shape[0] * shape[1]
+    place = count_event(x, y, p, t, height, width, operator, state)
+    if state.cursors[int(state.clock[CLOCK_PLANE]), CURSOR_CODED] < n_volumes:
+        for part in range(2):
+            complete(part, shape, operator, state)
+        finish(shape, state)
+    if place >= 0:
+        change_place(place, shape, operator, state)
+    if len(state.cursors) == 2:
+        share = float(np.clip((t - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
+        goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])
+        coded, projected = (int(goal) for goal in np.minimum(n_volumes, n_volumes * goals)[::-1])
+        coming = state.cursors[1 - int(state.clock[CLOCK_PLANE])]
+        behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
+        budget = 24 + 100 * int(behind) // n_volumes
+        look_ahead(projected, coded, budget, shape, operator, state)
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

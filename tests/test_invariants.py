@@ -29,7 +29,6 @@ from streamfeat.foreign.event_files import open_events
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.layout import CLOCK_PLANE, CLOCK_TOUCHED
 from streamfeat.recording import open_recording
-from streamfeat.state import read_features
 
 EXAMPLES = 25
 ids = "-".join
@@ -163,6 +162,21 @@ def test_features_are_those_of_the_window_after_every_batch(kind, look_ahead, da
         assert_agree(case, twin_of(engine), offline, counts, f"after {n} events")
 
 
+@pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
+@settings(max_examples=EXAMPLES)
+@given(data=st.data())
+def test_a_trace_holds_what_a_reading_after_each_event_would_have_given(kind, data):
+    case = data.draw(cases(kind))
+    events = data.draw(streams(case, 40))
+    engine, read = case.engine(look_ahead=True), case.engine()
+    features, accepted = engine.trace(events)
+    assert features.shape == (len(events), case.encoder.n_features)
+    for i in range(len(events)):
+        read.feed(events[i : i + 1])
+        np.testing.assert_array_equal(features[i], read.features())
+        assert accepted[i] == read.n_events
+
+
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("kind", KINDS, ids=ids)
 @settings(max_examples=EXAMPLES)
@@ -173,7 +187,9 @@ def test_following_leaves_nothing_to_do_for_a_reading(kind, look_ahead, data):
     engine = case.engine(look_ahead=look_ahead)
     for i in range(len(events)):
         engine.follow(events[i : i + 1])
-        followed, encoded = read_features(engine._operator, engine._state), engine.stats().encoded_volumes
+        followed = np.zeros(case.encoder.n_features, np.float32)
+        naive.read_features(engine._operator, engine._state, followed)
+        encoded = engine.stats().encoded_volumes
         end = now_us(events[: i + 1], case) or 0
         offline = case.encoder.encode(events[: i + 1], case.resolution, origin_us=0, t_us=end)
         counts = naive.window_counts(events[: i + 1], case.geometry, case.resolution, 0, end)

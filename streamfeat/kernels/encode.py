@@ -1,6 +1,6 @@
 """One volume of a plane: where it lies, what its code is, and its part in the pooled sums.
 
-Lives here: the choice of the code that the operator asks for, and pooling by quadrant.
+Lives here: the choice of the code that the operator asks for, pooling by quadrant, reading what is pooled.
 Not here: the codes themselves (`code`, `lasso`), and which volume is encoded when (`planes`, `update`).
 """
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from streamfeat.kernels.code import deviation, pool, soft_code, triangle_code, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.lasso import fix_atoms, lasso_code
-from streamfeat.kernels.layout import MOMENT_SQUARES, TRIANGLE, Operator, State
+from streamfeat.kernels.layout import CLOCK_PLANE, MOMENT_SQUARES, SPLIT, TRIANGLE, Operator, State
 
 ADD, TAKE = np.int64(1), np.int64(-1)
 """NumPy scalars, because a kernel is compiled once more for each Python literal it is called with."""
@@ -106,3 +106,27 @@ def pool_volume(
         state.encoded[part] += 1
     if moments[MOMENT_SQUARES] != 0:
         pool(state.code[part], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+
+
+@kernel
+def read_features(operator: Operator, state: State, features: NDArray[np.float32]) -> None:
+    """Write the pooled sums of the current plane as floats, quadrant by quadrant and without padding.
+
+    Args:
+        operator: number of filters, encoding and fixed point.
+        state: not changed.
+        features: `(4 K,)`, or `(8 K,)` for SPLIT, positive parts before negative ones; overwritten.
+    """
+    pooled, n = state.pooled[state.clock[CLOCK_PLANE]], operator.n_filters
+    width, per_unit = operator.offset.shape[0], 1.0 / operator.unit
+    for q in range(4):
+        if operator.kind == SPLIT:
+            sums, sizes = pooled[q, :width], pooled[q, width:]
+            positive, negative = features[2 * q * n : (2 * q + 1) * n], features[(2 * q + 1) * n :]
+            for k in range(n):
+                positive[k] = np.float32((np.int64(sizes[k]) + sums[k]) // 2 * per_unit)
+            for k in range(n):
+                negative[k] = np.float32((np.int64(sizes[k]) - sums[k]) // 2 * per_unit)
+        else:
+            for k in range(n):
+                features[q * n + k] = np.float32(pooled[q, k] * per_unit)

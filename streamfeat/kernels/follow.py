@@ -5,11 +5,12 @@ Not here: events that are only counted, to be read together (`ingest`, `update`)
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.events import Events
 from streamfeat.kernels.code import deviation, move_code
 from streamfeat.kernels.compiled import inlined, kernel
-from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant
+from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant, read_features
 from streamfeat.kernels.ingest import UNCHANGED, count_event
 from streamfeat.kernels.layout import (
     CLOCK_NOW,
@@ -20,6 +21,7 @@ from streamfeat.kernels.layout import (
     CURSOR_PROJECTED,
     MOMENT_SQUARES,
     PARTS,
+    TALLY_EVENTS,
     TRIANGLE,
     Operator,
     State,
@@ -133,13 +135,55 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
     applied[place] = after
 
 
+@inlined
+def follow_event(
+    x: int,
+    y: int,
+    p: int,
+    t: int,
+    height: int,
+    width: int,
+    shape: tuple[int, int],
+    operator: Operator,
+    state: State,
+) -> None:
+    """Count one event, and keep the current plane that of the counts.
+
+    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event.
+
+    Args:
+        x: column in pixels, any value.
+        y: row in pixels, any value.
+        p: polarity, any value.
+        t: stream time in microseconds, any value.
+        height: rows of the sensor, pixels.
+        width: columns of the sensor, pixels.
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: all of it may be changed. Nothing may be on the touched stack.
+    """
+    n_volumes = shape[0] * shape[1]
+    place = count_event(x, y, p, t, height, width, operator, state)
+    if state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED] < n_volumes:
+        for part in range(PARTS):
+            complete(part, shape, operator, state)
+        finish(shape, state)
+    if place != UNCHANGED:
+        change_place(place, shape, operator, state)
+    if state.cursors.shape[0] > 1:
+        share = min(max((t - state.clock[CLOCK_START]) / operator.bin_us, 0.0), 1.0)
+        projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
+        coded = min(n_volumes, int(n_volumes * max(share - CODED_FROM, 0.0) / (CODED_BY - CODED_FROM)))
+        coming = state.cursors[1 - state.clock[CLOCK_PLANE]]
+        behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
+        look_ahead(projected, coded, SLICE + HASTE * behind // n_volumes, shape, operator, state)
+
+
 @kernel
 def follow(
     events: Events, height: int, width: int, shape: tuple[int, int], operator: Operator, state: State
 ) -> None:
-    """Count events one by one, and keep the current plane that of the counts after each.
-
-    The plane that looks ahead is filled at the pace at which the bin goes by, a bounded slice an event.
+    """Follow every event of a batch, one by one.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
@@ -147,23 +191,38 @@ def follow(
         width: columns of the sensor, pixels.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
-        state: all of it may be changed. Nothing may be on the touched stack.
+        state: as for `follow_event`.
     """
-    n_volumes, bin_us = shape[0] * shape[1], operator.bin_us
     for i in range(events.shape[0]):
         event = events[i]
-        place = count_event(event.x, event.y, event.p, event.t, height, width, operator, state)
-        if state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED] < n_volumes:
-            for part in range(PARTS):
-                complete(part, shape, operator, state)
-            finish(shape, state)
-        if place != UNCHANGED:
-            change_place(place, shape, operator, state)
-        if state.cursors.shape[0] > 1:
-            share = min(max((event.t - state.clock[CLOCK_START]) / bin_us, 0.0), 1.0)
-            projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
-            coded = min(n_volumes, int(n_volumes * max(share - CODED_FROM, 0.0) / (CODED_BY - CODED_FROM)))
-            coming = state.cursors[1 - state.clock[CLOCK_PLANE]]
-            behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
-            budget = SLICE + HASTE * behind // n_volumes
-            look_ahead(projected, coded, budget, shape, operator, state)
+        follow_event(event.x, event.y, event.p, event.t, height, width, shape, operator, state)
+
+
+@kernel
+def trace(
+    events: Events,
+    height: int,
+    width: int,
+    shape: tuple[int, int],
+    operator: Operator,
+    state: State,
+    features: NDArray[np.float32],
+    accepted: NDArray[np.int64],
+) -> None:
+    """Follow every event of a batch, and read the features after each.
+
+    Args:
+        events: `(n,)` EVENT_DTYPE, any content; not changed.
+        height: rows of the sensor, pixels.
+        width: columns of the sensor, pixels.
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: as for `follow_event`.
+        features: `(n, 4 K)` or `(n, 8 K)`, overwritten.
+        accepted: `(n,)`, overwritten: events accepted so far.
+    """
+    for i in range(events.shape[0]):
+        event = events[i]
+        follow_event(event.x, event.y, event.p, event.t, height, width, shape, operator, state)
+        read_features(operator, state, features[i])
+        accepted[i] = state.tally[TALLY_EVENTS]

@@ -9,9 +9,10 @@ In four steps, because two of them can be done for both parts of the grid at onc
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, TAKE, covering, lower_half, pool_volume
+from streamfeat.kernels.encode import ADD, TAKE, covering, lower_half, pool_volume, read_features
 from streamfeat.kernels.layout import (
     CLOCK_DIRTY,
     CLOCK_NOW,
@@ -159,3 +160,17 @@ def update(shape: tuple[int, int], operator: Operator, state: State) -> None:
     for part in range(PARTS):
         complete(part, shape, operator, state)
     finish(shape, state)
+
+
+@kernel
+def read(shape: tuple[int, int], operator: Operator, state: State, features: NDArray[np.float32]) -> None:
+    """Make the current plane that of the counts, and read the features: both in one call from Python.
+
+    Args:
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: all of it may be changed.
+        features: as for `read_features`.
+    """
+    update(shape, operator, state)
+    read_features(operator, state, features)
