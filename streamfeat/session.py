@@ -65,6 +65,7 @@ class Session:
         classifier: predicts from each reading.
         learn_online: learn from each labelled sample after predicting it (prequential).
         clock: seconds, monotonic; used by the `auto` policy only.
+        engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -78,6 +79,7 @@ class Session:
         *,
         learn_online: bool = False,
         clock: Callable[[], float] = lambda: 0.0,
+        engine: Callable[..., Engine] = Engine,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -87,6 +89,7 @@ class Session:
         self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
         self._classifier = classifier
         self._clock = clock
+        self._make_engine = engine
         self._every_event = policy == EmitPolicy("events", 1)
         self._engine: Engine | None = None
         self._sample: Label | None = None
@@ -162,7 +165,9 @@ class Session:
             return self._engine
         if self._engine:
             _add_engine(self._stats, self._engine)
-        self._engine = Engine(self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event)
+        self._engine = self._make_engine(
+            self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event
+        )
         return self._engine
 
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:

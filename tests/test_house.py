@@ -14,7 +14,7 @@ PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
-    {"geometry", "files", "messages", "mcap_records", "svm", "simulate"},
+    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine"},
     {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
     {"kernels.encode", "codecs", "safe_arrays"},
     {"kernels.planes"},
@@ -22,11 +22,12 @@ LAYERS = [
     {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
-    {"encoder", "sinks"},
+    {"encoder", "sinks", "report"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
     {"pipeline"},
     {"replay"},
+    {"latency"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -34,16 +35,20 @@ LAYERS = [
 ROOMS = {
     "learn": [{"initial", "volumes", "whitening"}, {"dictionary", "transform"}, {"fit"}],
     "foreign": [{"words"}, {"tables"}, {"containers"}, {"event_files"}, {"datasets"}],
-    "cli": [{"program"}, {"learning", "recordings", "streaming"}],
+    "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
+    "cli": [{"program"}, {"learning", "measuring", "recordings", "streaming"}],
 }
 """The same inside packages that are one place in the layers."""
 
 ONLY_IN = {
-    "asyncio": {"pipeline", "replay"},
+    "asyncio": {"pipeline", "replay", "latency.hop"},
     "mcap": {"mcap_records", "recording", "recorder"},
     "zenoh": {"live"},
-    "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.streaming"},
-    "numba": {"kernels.compiled", "kernels.lasso"},
+    "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.measuring", "cli.streaming"},
+    "hdrh": {"latency.histogram"},
+    "bokeh": {"report", "latency.picture"},
+    "matplotlib": {"latency.picture"},
+    "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
 }
 
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}

@@ -6,6 +6,7 @@ Not here: the commands.
 
 import contextlib
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,8 +67,13 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an e
 
 
 @contextlib.contextmanager
-def progress_bars() -> Iterator[Callable[[str, int, int, str], None]]:
-    """A function (step, done, of how many, remark) that keeps a bar for each step on standard error."""
+def progress_bars(*, from_a_thread: bool = True) -> Iterator[Callable[[str, int, int, str], None]]:
+    """A function (step, done, of how many, remark) that keeps a bar for each step on standard error.
+
+    Args:
+        from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
+            called, once a second at most, so that nothing else runs while somebody measures.
+    """
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -76,13 +82,18 @@ def progress_bars() -> Iterator[Callable[[str, int, int, str], None]]:
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         TextColumn("[dim]{task.fields[remark]}"),
     )
-    with Progress(*columns, console=err, disable=not err.is_terminal) as progress:
+    with Progress(*columns, console=err, disable=not err.is_terminal, auto_refresh=from_a_thread) as progress:
         tasks: dict[str, Any] = {}
+        drawn = 0.0
 
         def report(step: str, done: int, total: int, remark: str) -> None:
+            nonlocal drawn
             if step not in tasks:
                 tasks[step] = progress.add_task(step, total=total or None, remark="")
             progress.update(tasks[step], completed=done, total=total or None, remark=escape(remark))
+            if not from_a_thread and time.monotonic() > drawn + 1:
+                progress.refresh()
+                drawn = time.monotonic()
 
         yield report
 

@@ -1,0 +1,137 @@
+"""Commands that measure: latency.
+
+Lives here: their arguments, and how their results are shown.
+Not here: the measurements (`latency`).
+"""
+
+import contextlib
+import json
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from streamfeat.cli.program import (
+    JsonOption,
+    OverwriteOption,
+    RecordingArgument,
+    TopicOption,
+    app,
+    err,
+    out,
+    progress_bars,
+    refuse_existing,
+)
+
+if TYPE_CHECKING:
+    from streamfeat.latency.measure import LatencyReport
+
+__all__ = ["latency"]
+
+_NOTABLE_STEAL = 0.05
+
+
+@app.command(
+    epilog="Example: streamfeat latency recordings/digits_test.mcap -m recordings/digits.safetensors "
+    "--plot latency.html"
+)
+def latency(
+    recording: RecordingArgument,
+    models: Annotated[
+        list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
+    ],
+    emit: Annotated[
+        list[str], typer.Option(help="When to read features: event, 1000ev, 10ms or auto; may be repeated.")
+    ] = ["event", "10ms", "auto"],  # noqa: B006  (Typer's way; it is never changed)
+    look_ahead: Annotated[
+        bool, typer.Option(help="Prepare bin boundaries beforehand where every event is followed.")
+    ] = True,
+    seconds: Annotated[float, typer.Option(help="Clock seconds for each measurement, at most.")] = 3.0,
+    limit_events: Annotated[
+        int, typer.Option(help="Events counted in each measurement of updates, at most.")
+    ] = 50_000,
+    warm_up: Annotated[int, typer.Option(help="Events that run before any is counted.")] = 2_000,
+    speed: Annotated[
+        float, typer.Option(help="Pace of the whole hop: 1 is the recorded one, 2 twice that.")
+    ] = 1.0,
+    split: Annotated[str | None, typer.Option(help="Measure on samples of this split only.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
+    ] = None,
+    topic: TopicOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Per-event update latency and that of a whole hop: percentiles for each model and policy."""
+    from streamfeat.latency.measure import LatencyReport
+    from streamfeat.latency.picture import check_picture, draw
+
+    if plot:
+        check_picture(plot)
+        refuse_existing(plot, overwrite=overwrite)
+    report = LatencyReport(
+        recording,
+        models,
+        emit,
+        topic=topic,
+        split=split,
+        warm_up=warm_up,
+        limit_events=limit_events,
+        seconds=seconds,
+        speed=speed,
+        look_ahead=look_ahead,
+    )
+    with _stopped_by_interrupt() as stopped, progress_bars(from_a_thread=False) as progress:
+        report.run(progress, stopped)
+    if as_json:
+        typer.echo(json.dumps(report.result()))
+    else:
+        _print(report)
+    if plot and report.rows:
+        draw(plot, report)
+    if report.interrupted:
+        raise typer.Exit(130)
+
+
+def _print(report: "LatencyReport") -> None:
+    from streamfeat.latency.words import COLUMNS, cells, describe, notes
+
+    for name in dict.fromkeys(row.model.name for row in report.rows):
+        rows = [row for row in report.rows if row.model.name == name]
+        title = escape(describe(rows[0].model))
+        table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        for i, column in enumerate(COLUMNS):
+            table.add_column(column, justify="left" if i < 2 else "right", style="bold" if i == 4 else "")
+        for row in rows:
+            table.add_row(*map(escape, cells(row)))
+        out.print(table)
+    for note in notes(report):
+        out.print(f"[dim]{escape(note)}[/]")
+    if report.steal is not None and report.steal > _NOTABLE_STEAL:
+        err.print(
+            f"[yellow]steal:[/] {100 * report.steal:.0f} % of the processor time went to other virtual "
+            "machines; the tails are theirs too",
+            soft_wrap=True,
+        )
+
+
+@contextlib.contextmanager
+def _stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
+    """A function that says whether SIGINT has come. A second one interrupts as usual."""
+    came = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal came
+        came = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: came
+    finally:
+        signal.signal(signal.SIGINT, before)

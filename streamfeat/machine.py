@@ -1,0 +1,61 @@
+"""The machine that figures were measured on.
+
+Lives here: its description, and how much of its time was given to others.
+Not here: measuring anything of streamfeat.
+"""
+
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+__all__ = ["StealClock", "describe_machine"]
+
+_CPUINFO, _STAT = Path("/proc/cpuinfo"), Path("/proc/stat")
+_STEAL = 7
+"""Column of /proc/stat: time that the hypervisor gave to another machine."""
+_GUEST = 8
+"""Columns from here on are part of earlier ones."""
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, cores that this process may use, system, and versions, as JSON values."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("numba", "numpy", "streamfeat")},
+    }
+
+
+class StealClock:
+    """Tells which share of the processor time since it was made went to other virtual machines."""
+
+    def __init__(self) -> None:
+        """Start now."""
+        self._start = _jiffies()
+
+    def share(self) -> float | None:
+        """Between 0 and 1; None where the system does not say."""
+        now = _jiffies()
+        if self._start is None or now is None:
+            return None
+        total = sum(now) - sum(self._start)
+        return (now[_STEAL] - self._start[_STEAL]) / total if total > 0 else 0.0
+
+
+def _cpu_model() -> str:
+    if _CPUINFO.exists():
+        for line in _CPUINFO.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _jiffies() -> list[int] | None:
+    if not _STAT.exists():
+        return None
+    columns = _STAT.read_text().split("\n", 1)[0].split()[1:]
+    return [int(column) for column in columns[:_GUEST]] if len(columns) > _STEAL else None
