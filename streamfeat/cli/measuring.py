@@ -104,9 +104,11 @@ def _print(report: "LatencyReport") -> None:
     for name in dict.fromkeys(row.model.name for row in report.rows):
         rows = [row for row in report.rows if row.model.name == name]
         title = escape(describe(rows[0].model))
-        table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
         for i, column in enumerate(COLUMNS):
-            table.add_column(column, justify="left" if i < 2 else "right", style="bold" if i == 4 else "")
+            side = "left" if i < 2 else "right"
+            style = "bold" if column == "p50" else ""
+            table.add_column(column.replace("/", "\n/"), justify=side, style=style, overflow="fold")
         for row in rows:
             table.add_row(*map(escape, cells(row)))
         out.print(table)

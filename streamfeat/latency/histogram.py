@@ -59,7 +59,7 @@ class Latencies:
         return int(self._histogram.get_value_at_percentile(percent))
 
     def figures(self) -> dict[str, Any]:
-        """`n`, `mean_ns`, a `..._ns` for each percentile, `max_ns`, and how the tail compares to the middle."""
+        """`n`, `mean_ns`, a `..._ns` for each percentile, `max_ns`, and ratios of tail to middle."""
         names = [f"p{percent:g}" for percent in PERCENTILES]
         found = dict(zip(names, map(self.percentile, PERCENTILES), strict=True))
         middle = found["p50"]
@@ -68,9 +68,9 @@ class Latencies:
             return round(tail / middle, 2) if tail and middle else None
 
         return (
-            {"n": self.n, "mean_ns": round(self._histogram.get_mean_value(), 1)}
+            {"n": self.n, "mean_ns": round(self._histogram.get_mean_value(), 1) if self.n else None}
             | {f"{name}_ns": value for name, value in found.items()}
-            | {"max_ns": int(self._histogram.get_max_value())}
+            | {"max_ns": int(self._histogram.get_max_value()) if self.n else None}
             | {f"{name}_to_p50": ratio(found[name]) for name in names[2:]}
         )
 
@@ -84,5 +84,5 @@ class Latencies:
         for item in self._histogram.get_recorded_iterator():
             beyond.append(self.n / (self.n - before))
             ns.append(float(self._histogram.get_highest_equivalent_value(item.value_iterated_to)))
-            before += item.count_at_this_value
+            before = item.total_count_to_this_value
         return np.array(beyond), np.array(ns)

@@ -79,13 +79,14 @@ def hop(
         speed=speed,
         on_progress=note,
     )
-    asyncio.run(_run(pipeline, goes))
+    stopped_ns = asyncio.run(_run(pipeline, goes))
     arrived_ns, brought_by_us = (np.array(v, np.int64) for v in (sink.arrived_ns, session.brought_by_us))
     if len(arrived_ns) == 0:
         return arrived_ns
     ((started_ns, first_us),) = started
     due_ns = started_ns + np.round((brought_by_us - first_us) * (1000 / speed)).astype(np.int64)
-    return arrived_ns - due_ns
+    # A stop ends the wait for a packet that is not due yet.
+    return (arrived_ns - due_ns)[due_ns <= stopped_ns]
 
 
 def without_silence(items: Iterable[Item], gap_us: int) -> Iterator[Item]:
@@ -103,17 +104,21 @@ def without_silence(items: Iterable[Item], gap_us: int) -> Iterator[Item]:
             yield replace(item, events=events)
 
 
-async def _run(pipeline: Pipeline, goes: Callable[[], bool]) -> None:
+async def _run(pipeline: Pipeline, goes: Callable[[], bool]) -> int:
+    """Run until the end or until it goes no more; when that was, in nanoseconds of the clock."""
     loop = asyncio.get_running_loop()
+    stopped: list[int] = []
 
     def ask() -> None:
         if goes():
             loop.call_later(_ASK_EVERY_S, ask)
         else:
+            stopped.append(monotonic_ns())
             pipeline.stop()
 
     ask()
     await pipeline.run()
+    return stopped[0] if stopped else monotonic_ns()
 
 
 def _engine(may_look_ahead: bool, *arguments: Any, look_ahead: bool, **options: Any) -> Engine:

@@ -5,8 +5,8 @@ Not here: the measurements (`update`, `hop`), how rows look (`picture`, `cli`).
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -185,13 +185,9 @@ class LatencyReport:
         }
 
     def _load(self, rec: Recording) -> list[Item]:
-        items: list[Item] = []
-        wanted, events = self._warm_up + self._limit, 0
-        for item in items_of_split(rec.items(), self._split):
-            items.append(item)
-            events += len(item.events) if isinstance(item, Packet) else 0
-            if events >= wanted:
-                break
+        wanted = self._warm_up + self._limit
+        items = list(_first_events(items_of_split(rec.items(), self._split), wanted))
+        events = sum(len(item.events) for item in items if isinstance(item, Packet))
         if self._split is not None and not items:
             raise InputError(f"{self._recording}: has no samples of split {self._split!r}")
         if events == 0:
@@ -260,12 +256,16 @@ class LatencyReport:
             per_event = np.round(found.batch_ns / np.maximum(found.batch_events, 1)).astype(np.int64)
             yield row("ingest", Latencies(per_event, found.batch_events))
             yield row("reading", Latencies(found.reading_ns))
-        begun = time.monotonic()
+        hop_ends: list[float] = []
 
         def hop_goes() -> bool:
-            spent = time.monotonic() - begun
-            report(step, min(int(spent * 1000), int(self._seconds * 1000)), int(self._seconds * 1000), "hop")
-            return spent < self._seconds and not stopped()
+            if not hop_ends:  # what warms up comes before the first question
+                report(step, 0, 0, f"whole hop, {self._seconds:g} s")
+                hop_ends.append(time.monotonic() + self._seconds)
+            going = time.monotonic() < hop_ends[0] and not stopped()
+            if not going:
+                report(step, 0, 0, "whole hop, what is still queued")
+            return going
 
         took = hop(
             encoder,
@@ -273,16 +273,18 @@ class LatencyReport:
             policy,
             speed=self._speed,
             look_ahead=self._look_ahead,
-            warm_up=self._warming(),
+            warm_up=_first_events(self._items, self._warm_up),
             goes=hop_goes,
         )
         yield row("whole hop", Latencies(took))
 
-    def _warming(self) -> Iterator[Item]:
-        """Items until the warm-up is over."""
-        events = 0
-        for item in self._items:
-            yield item
-            events += len(item.events) if isinstance(item, Packet) else 0
-            if events >= self._warm_up:
-                return
+
+def _first_events(items: Iterable[Item], n: int) -> Iterator[Item]:
+    """Items until `n` events are there; the packet that has the last of them is cut."""
+    for item in items:
+        if isinstance(item, Packet):
+            item = replace(item, events=item.events[:n])
+            n -= len(item.events)
+        yield item
+        if n <= 0:
+            return

@@ -25,8 +25,16 @@ __all__ = ["check_picture", "draw"]
 
 _LIBRARIES = {".html": "bokeh", ".png": "matplotlib"}
 _MOST_POINTS = 6_000
+_LONGEST_SILENCE_US = 100_000
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
-_DASHES = {"update": "solid", "bin boundary": "dotted", "whole hop": "dashed"}
+_DASHES = {
+    "update": "solid",
+    "bin boundary": "dotted",
+    "from Python": "dashdot",
+    "ingest": "dotted",
+    "reading": "solid",
+    "whole hop": "dashed",
+}
 _MATPLOTLIB_DASHES = {"solid": "-", "dotted": ":", "dashed": "--", "dashdot": "-."}
 _TICKS = {1: "0 %", 10: "90 %", 100: "99 %", 1_000: "99.9 %", 10_000: "99.99 %", 100_000: "99.999 %"}
 _PERCENTILE_AXIS = "percentile"
@@ -65,32 +73,40 @@ def _name(row: Row, several: bool) -> str:
 
 
 def _lines(report: LatencyReport) -> list[_Line]:
-    """Name, colour, dash and points (percentile axis, microseconds) of each curve."""
+    """Name, colour, dash and points (percentile axis, microseconds) of each curve.
+
+    A colour stands for a model and a policy, a dash for what was measured.
+    """
     several = len({row.model.name for row in report.rows}) > 1
     lines: list[_Line] = []
+    colours: dict[tuple[str, str], str] = {}
     for row in report.rows:
         if row.latencies.n:
             beyond, ns = row.latencies.curve()
             # The last step has no end; drawn a little on, it can be seen.
             beyond, ns = np.append(beyond, 1.5 * beyond[-1]), np.append(ns, ns[-1])
-            colour = _COLOURS[len(lines) % len(_COLOURS)]
-            dash = _DASHES.get(row.what, "dashdot")
-            lines.append((_name(row, several), colour, dash, beyond, ns / 1000))
+            colour = colours.setdefault((row.model.name, row.emit), _COLOURS[len(colours) % len(_COLOURS)])
+            lines.append((_name(row, several), colour, _DASHES[row.what], beyond, ns / 1000))
     return lines
 
 
 def _walks(report: LatencyReport) -> list[tuple[str, Walk]]:
-    return [(describe(row.model), row.walk) for row in report.rows if row.walk and len(row.walk.ns)]
+    """Caption and content of each cloud of events."""
+    return [
+        (f"{describe(row.model)}; of {len(row.walk.ns):,} events the slowest, and some others", row.walk)
+        for row in report.rows
+        if row.walk and len(row.walk.ns)
+    ]
 
 
 def _points(
-    walk: Walk, window_us: int = 100_000
+    walk: Walk,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Seconds of stream time, microseconds and whether a bin began, of as many events as one can see.
 
     Events that began a bin and the slowest are all kept, of the others every n-th.
     """
-    steps = np.clip(np.diff(walk.t_us, prepend=walk.t_us[:1]), 0, window_us)
+    steps = np.clip(np.diff(walk.t_us, prepend=walk.t_us[:1]), 0, _LONGEST_SILENCE_US)
     seconds = np.cumsum(steps) / 1e6
     keep = np.zeros(len(walk.ns), np.bool_)
     keep[:: -(-len(walk.ns) // (_MOST_POINTS // 2))] = True
@@ -129,7 +145,6 @@ def _curves_of_page(report: LatencyReport) -> "figure":
         x_axis_label=_PERCENTILE_AXIS,
         y_axis_label=_LATENCY_AXIS,
         tools="pan,wheel_zoom,box_zoom,reset,save",
-        output_backend="svg",
     )
     items = []
     for name, colour, dash, beyond, us in _lines(report):

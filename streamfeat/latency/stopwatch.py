@@ -74,7 +74,7 @@ def python_clock_cost_ns(reads: int = 20_000) -> float:
 @njit(nogil=True)
 def _now(timespec: Stamps) -> int:
     _clock_gettime(_MONOTONIC, timespec.ctypes)
-    return timespec[0] * 1_000_000_000 + timespec[1]
+    return timespec[0] * 1_000_000_000 + timespec[1]  # type: ignore[no-any-return]
 
 
 @njit(nogil=True)

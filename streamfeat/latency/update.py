@@ -110,7 +110,8 @@ def feed_and_read(
         encoder: the frozen encoder.
         items: packets and labels in stream order.
         policy: when to read; not after every event, which is `walk`.
-        warm_up: events at the start that are fed, and read, but not counted.
+        warm_up: events at the start that are fed but not counted; a batch or a reading counts that reaches
+            beyond them.
         goes: asked after each item.
     """
     log = _Log()

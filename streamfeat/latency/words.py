@@ -9,18 +9,19 @@ from streamfeat.latency.measure import LatencyReport, Model, Row
 __all__ = ["COLUMNS", "cells", "describe", "notes", "spell"]
 
 COLUMNS = ("emit", "what", "n", "mean", "p50", "p90", "p99", "p99.9", "max", "p99/p50", "p99.9/p50")
-"""Of a row as text, see `cells`; all but the first two are numbers."""
+"""Of a row as text, see `cells`; all but the first two are numbers, times as in `spell`."""
 
 
 def spell(ns: float | None) -> str:
-    """A time in the unit that suits it, to 3 digits."""
+    """A time to 3 digits: microseconds below 10 ms, from there on with its unit; `-` for None."""
     if ns is None:
         return "-"
-    units = (("ns", 1.0), ("µs", 1e3), ("ms", 1e6), ("s", 1e9))
-    unit, size = next(((u, s) for u, s in units if ns < 999.5 * s), units[-1])
-    value = ns / size
-    digits = 0 if value >= 99.95 or size == 1 else 1 if value >= 9.995 else 2
-    return f"{value:.{digits}f} {unit}"
+    for unit, size, most in (("", 1e3, 1e7), (" ms", 1e6, 1e9), (" s", 1e9, float("inf"))):
+        if ns < most:
+            value = ns / size
+            break
+    digits = 0 if value >= 99.95 else 1 if value >= 9.995 else 2 if value >= 0.9995 else 3
+    return f"{value:,.{digits}f}{unit}"
 
 
 def cells(row: Row) -> list[str]:
@@ -33,7 +34,7 @@ def cells(row: Row) -> list[str]:
         row.what,
         f"{row.latencies.n:,}",
         *[spell(ns) for ns in times],
-        *["-" if ratio is None else f"{ratio:.1f}" for ratio in ratios],
+        *["-" if ratio is None else f"{ratio:.3g}" for ratio in ratios],
     ]
 
 
@@ -51,7 +52,8 @@ def notes(report: LatencyReport) -> list[str]:
     result = report.result()
     machine = result["machine"]
     said = [
-        f"Not counted: compilation, and the first {result['warm_up_events']:,} events of each measurement.",
+        "Times in microseconds where no unit is given. Not counted: compilation, and the first "
+        f"{result['warm_up_events']:,} events of each measurement.",
         "update: from handing over an event until features are current, timed in a compiled loop; "
         "bin boundary: those events alone that begin a bin. from Python: follow() and features() called for "
         "each event. ingest: feed(), for each event; reading: features(). whole hop: from when a packet is "
