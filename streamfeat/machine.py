@@ -1,16 +1,17 @@
 """The machine that figures were measured on.
 
-Lives here: its description, and how much of its time was given to others.
+Lives here: its description, and how far others disturbed what was measured.
 Not here: measuring anything of streamfeat.
 """
 
 import os
 import platform
+import resource
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["StealClock", "describe_machine"]
+__all__ = ["Disturbance", "describe_machine"]
 
 _CPUINFO, _STAT = Path("/proc/cpuinfo"), Path("/proc/stat")
 _STEAL = 7
@@ -30,15 +31,20 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-class StealClock:
-    """Tells which share of the processor time since it was made went to other virtual machines."""
+class Disturbance:
+    """What others have done to this process since it was made."""
 
     def __init__(self) -> None:
         """Start now."""
         self._start = _jiffies()
+        self._preempted = _preemptions()
 
-    def share(self) -> float | None:
-        """Between 0 and 1; None where the system does not say."""
+    def preemptions(self) -> int:
+        """How often the system took the processor away to run something else."""
+        return _preemptions() - self._preempted
+
+    def steal_share(self) -> float | None:
+        """Share of all processor time that went to other virtual machines, 0 to 1; None where unknown."""
         now = _jiffies()
         if self._start is None or now is None:
             return None
@@ -52,6 +58,10 @@ def _cpu_model() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def _preemptions() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
 
 
 def _jiffies() -> list[int] | None:

@@ -86,8 +86,15 @@ def latency(
         speed=speed,
         look_ahead=look_ahead,
     )
-    with _stopped_by_interrupt() as stopped, progress_bars(from_a_thread=False) as progress:
-        report.run(progress, stopped)
+    try:
+        with progress_bars(from_a_thread=False) as progress:
+            progress("compiling", 0, 0, "not counted")
+            report.compile()
+            progress("compiling", 1, 1, "")
+            with _stopped_by_interrupt() as stopped:
+                report.run(progress, stopped)
+    except KeyboardInterrupt:  # before there is anything to show, or for the second time
+        raise typer.Exit(130) from None
     if as_json:
         typer.echo(json.dumps(report.result()))
     else:
@@ -105,10 +112,11 @@ def _print(report: "LatencyReport") -> None:
         rows = [row for row in report.rows if row.model.name == name]
         title = escape(describe(rows[0].model))
         table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-        for i, column in enumerate(COLUMNS):
-            side = "left" if i < 2 else "right"
-            style = "bold" if column == "p50" else ""
-            table.add_column(column.replace("/", "\n/"), justify=side, style=style, overflow="fold")
+        for column in COLUMNS[:2]:
+            table.add_column(column, overflow="fold")
+        for column in COLUMNS[2:]:
+            name, style = column.replace("/", "\n/"), "bold" if column == "p50" else ""
+            table.add_column(name, justify="right", style=style, overflow="fold")
         for row in rows:
             table.add_row(*map(escape, cells(row)))
         out.print(table)

@@ -20,7 +20,7 @@ from streamfeat.latency.histogram import Latencies
 from streamfeat.latency.hop import hop
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
-from streamfeat.machine import StealClock, describe_machine
+from streamfeat.machine import Disturbance, describe_machine
 from streamfeat.recording import Label, Packet, Recording, open_recording
 from streamfeat.replay import items_of_split
 
@@ -132,33 +132,37 @@ class LatencyReport:
         self._check_fit(models)
         self.rows: list[Row] = []
         self.interrupted = False
-        self.clock_ns: float | None = None
-        self.python_clock_ns: float | None = None
+        self.clock_ns = self.python_clock_ns = 0.0
         self.steal: float | None = None
+        self.preemptions = 0
+
+    def compile(self) -> None:
+        """Let numba compile what `run` will call, and measure what reading the clock costs."""
+        packet = next(item for item in self._items if isinstance(item, Packet) and len(item.events))
+        first, encoder = packet.events[:1].copy(), self._models[0].encoder
+        engine = Engine(encoder, packet.resolution, look_ahead=self._look_ahead)
+        engine.feed(first)
+        engine.follow(first)
+        follow_timed(engine, first)
+        engine.advance(int(first["t"][0]) + encoder.geometry.window_us)
+        engine.features()
+        self.clock_ns, self.python_clock_ns = clock_cost_ns(), python_clock_cost_ns()
 
     def run(self, report: Report, stopped: Callable[[], bool]) -> None:
-        """Measure; `rows` grows as it goes.
+        """Measure; `rows` grows as it goes. To be called after `compile`.
 
         Args:
             report: told (step, done, of how many, remark).
             stopped: asked often whether to end early, with what has been measured so far.
         """
-        steal = StealClock()
-        report("compiling", 0, 0, "not counted")
-        self._compile(self._models[0].encoder)
-        report("compiling", 1, 1, "")
-        self.clock_ns = clock_cost_ns()
-        self.python_clock_ns = python_clock_cost_ns()
+        disturbance = Disturbance()
         with open_recording(self._recording, self._topic) as rec:
             for model in self._models:
                 for emit, policy in self._policies:
-                    for row in self._rows_of(model, emit, policy, rec, report, stopped):
-                        if row.latencies.n or not stopped():
-                            self.rows.append(row)
-                        if stopped():
-                            break
+                    found = self._rows_of(_Job(model, emit, policy, rec, report, stopped))
+                    self.rows += [row for row in found if row.latencies.n or not stopped()]
         self.interrupted = stopped()
-        self.steal = steal.share()
+        self.steal, self.preemptions = disturbance.steal_share(), disturbance.preemptions()
 
     def result(self) -> dict[str, Any]:
         """What was measured, as JSON values."""
@@ -168,6 +172,7 @@ class LatencyReport:
             "clock_ns": self.clock_ns,
             "python_clock_ns": self.python_clock_ns,
             "steal_share": None if self.steal is None else round(self.steal, 4),
+            "preemptions": self.preemptions,
             "warm_up_events": self._warm_up,
             "limit_events": self._limit,
             "seconds": self._seconds,
@@ -207,76 +212,91 @@ class LatencyReport:
                 except InputError as error:
                     raise InputError(f"{path}: does not fit {self._recording}: {error}") from error
 
-    def _compile(self, encoder: Encoder) -> None:
-        packet = next(item for item in self._items if isinstance(item, Packet) and len(item.events))
-        engine = Engine(encoder, packet.resolution, look_ahead=self._look_ahead)
-        engine.feed(packet.events[:1])
-        engine.follow(packet.events[:1])
-        follow_timed(engine, packet.events[:1].copy())
-        engine.advance(int(packet.events["t"][0]) + encoder.geometry.window_us)
-        engine.features()
-
-    def _rows_of(
-        self,
-        model: Model,
-        emit: str,
-        policy: EmitPolicy,
-        rec: Recording,
-        report: Report,
-        stopped: Callable[[], bool],
-    ) -> Iterator[Row]:
-        encoder, step = model.encoder, f"{model.name}, {emit}"
-
-        def row(what: str, latencies: Latencies, **more: Any) -> Row:
-            return Row(model, emit, what, latencies, **more)
-
-        def goes(what: str) -> Callable[[int], bool]:
-            begun: list[float] = []
-
-            def ask(done: int) -> bool:
-                report(step, min(done, self._warm_up + self._limit), self._warm_up + self._limit, what)
-                if done >= self._warm_up and not begun:
-                    begun.append(time.monotonic())
-                return not stopped() and (not begun or time.monotonic() < begun[0] + self._seconds)
-
-            return ask
-
-        if policy == EmitPolicy("events", 1):
-            each = {"look_ahead": self._look_ahead, "warm_up": self._warm_up}
-            walked = walk(encoder, self._items, **each, goes=goes("update"))  # type: ignore[arg-type]
-            share = float(walked.begins_bin.mean()) if len(walked.ns) else 0.0
-            yield row("update", Latencies(walked.ns), boundary_share=share, walk=walked)
-            yield row("bin boundary", Latencies(walked.ns[walked.begins_bin]))
-            called = call_each(encoder, self._items, **each, goes=goes("from Python"))  # type: ignore[arg-type]
-            yield row("from Python", Latencies(called.ns))
+    def _rows_of(self, job: "_Job") -> Iterator[Row]:
+        if job.policy == EmitPolicy("events", 1):
+            steps = [self._updates, self._calls, self._hop]
         else:
-            found = feed_and_read(
-                encoder, self._items, policy, warm_up=self._warm_up, goes=goes("feed and read")
-            )
-            per_event = np.round(found.batch_ns / np.maximum(found.batch_events, 1)).astype(np.int64)
-            yield row("ingest", Latencies(per_event, found.batch_events))
-            yield row("reading", Latencies(found.reading_ns))
-        hop_ends: list[float] = []
+            steps = [self._readings, self._hop]
+        for step in steps:
+            if not job.stopped():
+                yield from step(job)
 
-        def hop_goes() -> bool:
-            if not hop_ends:  # what warms up comes before the first question
-                report(step, 0, 0, f"whole hop, {self._seconds:g} s")
-                hop_ends.append(time.monotonic() + self._seconds)
-            going = time.monotonic() < hop_ends[0] and not stopped()
+    def _updates(self, job: "_Job") -> Iterator[Row]:
+        goes = self._budget(job, "update")
+        found = walk(
+            job.model.encoder, self._items, look_ahead=self._look_ahead, warm_up=self._warm_up, goes=goes
+        )
+        share = float(found.begins_bin.mean()) if len(found.ns) else 0.0
+        yield job.row("update", Latencies(found.ns), boundary_share=share, walk=found)
+        yield job.row("bin boundary", Latencies(found.ns[found.begins_bin]))
+
+    def _calls(self, job: "_Job") -> Iterator[Row]:
+        goes = self._budget(job, "from Python")
+        found = call_each(
+            job.model.encoder, self._items, look_ahead=self._look_ahead, warm_up=self._warm_up, goes=goes
+        )
+        yield job.row("from Python", Latencies(found.ns))
+
+    def _readings(self, job: "_Job") -> Iterator[Row]:
+        goes = self._budget(job, "feed and read")
+        found = feed_and_read(job.model.encoder, self._items, job.policy, warm_up=self._warm_up, goes=goes)
+        each_event = np.round(found.batch_ns / found.batch_events).astype(np.int64)
+        yield job.row("ingest", Latencies(each_event, found.batch_events))
+        yield job.row("reading", Latencies(found.reading_ns))
+
+    def _hop(self, job: "_Job") -> Iterator[Row]:
+        ends: list[float] = []
+
+        def goes() -> bool:
+            if not ends:  # what warms up comes before the first question
+                job.tell(0, 0, f"whole hop, {self._seconds:g} s")
+                ends.append(time.monotonic() + self._seconds)
+            going = time.monotonic() < ends[0] and not job.stopped()
             if not going:
-                report(step, 0, 0, "whole hop, what is still queued")
+                job.tell(0, 0, "whole hop, what is still queued")
             return going
 
         took = hop(
-            encoder,
-            items_of_split(rec.items(), self._split),
-            policy,
+            job.model.encoder,
+            items_of_split(job.recording.items(), self._split),
+            job.policy,
             speed=self._speed,
             look_ahead=self._look_ahead,
             warm_up=_first_events(self._items, self._warm_up),
-            goes=hop_goes,
+            goes=goes,
         )
-        yield row("whole hop", Latencies(took))
+        yield job.row("whole hop", Latencies(took))
+
+    def _budget(self, job: "_Job", what: str) -> Callable[[int], bool]:
+        """Says, told how many events are done, whether to go on; the clock starts after the warm-up."""
+        ends: list[float] = []
+        total = self._warm_up + self._limit
+
+        def goes(done: int) -> bool:
+            job.tell(done, total, what)
+            if done >= self._warm_up and not ends:
+                ends.append(time.monotonic() + self._seconds)
+            return not job.stopped() and (not ends or time.monotonic() < ends[0])
+
+        return goes
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """One model with one policy, and whom to tell and ask meanwhile."""
+
+    model: Model
+    emit: str
+    policy: EmitPolicy
+    recording: Recording
+    report: Report
+    stopped: Callable[[], bool]
+
+    def row(self, what: str, latencies: Latencies, **more: Any) -> Row:
+        return Row(self.model, self.emit, what, latencies, **more)
+
+    def tell(self, done: int, total: int, what: str) -> None:
+        self.report(f"{self.model.name}, {self.emit}", done, total, what)
 
 
 def _first_events(items: Iterable[Item], n: int) -> Iterator[Item]:

@@ -170,9 +170,14 @@ def _engines(encoder: Encoder, items: Iterable[Item], look_ahead: bool) -> Itera
 
 def _ready_engine(encoder: Encoder, resolution: Resolution, origin_us: int, look_ahead: bool) -> Engine:
     engine = Engine(encoder, resolution, origin_us=origin_us, look_ahead=look_ahead)
+    _touch(engine)
+    return engine
+
+
+def _touch(engine: Engine) -> None:
+    """Write to all memory of an engine without changing it."""
     for array in engine._state:
         array += 0
-    return engine
 
 
 def _call_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -201,8 +206,7 @@ class _LoggedEngine(Engine):
         super().__init__(*arguments, **options)
         self._log = log
         self._moved_ns = 0
-        for array in self._state:
-            array += 0
+        _touch(self)
 
     def feed(self, batch: Events) -> None:
         begun = monotonic_ns()

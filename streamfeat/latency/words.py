@@ -16,10 +16,8 @@ def spell(ns: float | None) -> str:
     """A time to 3 digits: microseconds below 10 ms, from there on with its unit; `-` for None."""
     if ns is None:
         return "-"
-    for unit, size, most in (("", 1e3, 1e7), (" ms", 1e6, 1e9), (" s", 1e9, float("inf"))):
-        if ns < most:
-            value = ns / size
-            break
+    unit, size = ("", 1e3) if ns < 1e7 else (" ms", 1e6) if ns < 1e9 else (" s", 1e9)
+    value = ns / size
     digits = 0 if value >= 99.95 else 1 if value >= 9.995 else 2 if value >= 0.9995 else 3
     return f"{value:,.{digits}f}{unit}"
 
@@ -65,10 +63,14 @@ def notes(report: LatencyReport) -> list[str]:
         for row in report.rows
         if row.boundary_share is not None
     ]
-    if result["clock_ns"] is not None:
+    said.append(
+        f"Reading the clock costs {result['clock_ns']:.0f} ns, {result['python_clock_ns']:.0f} ns from "
+        "Python; once in each latency, not subtracted. - stands where n is too small for a percentile."
+    )
+    if result["steal_share"] is not None:
         said.append(
-            f"Reading the clock costs {result['clock_ns']:.0f} ns, {result['python_clock_ns']:.0f} ns from "
-            "Python; once in each latency, not subtracted. - stands where n is too small for a percentile."
+            f"Other virtual machines had {100 * result['steal_share']:.1f} % of the processor time; other "
+            f"processes interrupted this one {result['preemptions']:,} times."
         )
     said.append(
         f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}, "
