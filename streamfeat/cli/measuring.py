@@ -51,7 +51,7 @@ def latency(
     look_ahead: Annotated[
         bool, typer.Option(help="Prepare bin boundaries beforehand where every event is followed.")
     ] = True,
-    seconds: Annotated[float, typer.Option(help="Clock seconds for each measurement, at most.")] = 3.0,
+    seconds: Annotated[float, typer.Option(help="Clock seconds for each measurement, at most.")] = 2.0,
     limit_events: Annotated[
         int, typer.Option(help="Events counted in each measurement of updates, at most.")
     ] = 50_000,

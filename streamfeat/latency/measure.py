@@ -105,7 +105,7 @@ class LatencyReport:
         split: str | None = None,
         warm_up: int = 2_000,
         limit_events: int = 50_000,
-        seconds: float = 3.0,
+        seconds: float = 2.0,
         speed: float = 1.0,
         look_ahead: bool = True,
     ) -> None:

@@ -54,8 +54,9 @@ def notes(report: LatencyReport) -> list[str]:
         f"{result['warm_up_events']:,} events of each measurement.",
         "update: from handing over an event until features are current, timed in a compiled loop; "
         "bin boundary: those events alone that begin a bin. from Python: follow() and features() called for "
-        "each event. ingest: feed(), for each event; reading: features(). whole hop: from when a packet is "
-        f"due, at {result['speed']:g} x the recorded pace, until a sink holds what was read.",
+        "each event. ingest: feed(), its time shared out among the events of a batch; reading: features(). "
+        f"whole hop: from when a packet is due, at {result['speed']:g} x the recorded pace, until a sink "
+        "holds what was read.",
     ]
     how = "with" if result["look_ahead"] else "without"
     said += [
