@@ -285,9 +285,9 @@ def test_silence_between_samples_is_cut_and_nothing_else_changes():
         (12_345, "12.3"),
         (123_456, "123"),
         (9_999_000, "9,999"),
-        (10_000_000, "10.0 ms"),
-        (543_210_000, "543 ms"),
-        (10_460_594_000, "10.5 s"),
+        (10_000_000, "10.0ms"),
+        (543_210_000, "543ms"),
+        (10_460_594_000, "10.5s"),
     ],
 )
 def test_times_are_short(ns, text):
@@ -386,9 +386,12 @@ def test_a_row_for_each_model_policy_and_part(run, home):
             assert row["boundary_share"] == pytest.approx(boundary["n"] / row["n"], abs=1e-6)
 
 
-def test_a_real_recording_with_its_model(run):
+@pytest.mark.parametrize("steal", [None, 0.05, 0.31])
+def test_a_real_recording_with_its_model(run, monkeypatch, steal):
+    monkeypatch.setattr(Disturbance, "steal_share", lambda self: steal)
     status, out, err = run(DIGITS, "-m", DIGITS_MODEL, "--emit", "event", *QUICK)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err.startswith("steal: 31 % of the processor time") if steal == 0.31 else err == ""
     assert out.startswith("digits: direct, split, K = 100")
     assert re.search(r"event +update +[1-9][\d,]* ", out)
     assert "the first 500 events of each measurement" in out

@@ -13,10 +13,10 @@ COLUMNS = ("emit", "what", "n", "mean", "p50", "p90", "p99", "p99.9", "max", "p9
 
 
 def spell(ns: float | None) -> str:
-    """A time to 3 digits: microseconds below 10 ms, from there on with its unit; `-` for None."""
+    """A time to 3 digits: microseconds below 10 ms, from there on with a unit; `-` for None."""
     if ns is None:
         return "-"
-    unit, size = ("", 1e3) if ns < 1e7 else (" ms", 1e6) if ns < 1e9 else (" s", 1e9)
+    unit, size = ("", 1e3) if ns < 1e7 else ("ms", 1e6) if ns < 1e9 else ("s", 1e9)
     value = ns / size
     digits = 0 if value >= 99.95 else 1 if value >= 9.995 else 2 if value >= 0.9995 else 3
     return f"{value:,.{digits}f}{unit}"
