@@ -59,8 +59,10 @@ def hop(
 
     Returns:
         nanoseconds for each emission, in order, `(n,)` int64.
-    """
 
+    Raises:
+        InputError: a sensor has no place for a volume.
+    """
     engine = partial(_engine, look_ahead)
     warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
     asyncio.run(Pipeline(warm_up, warming, [_WatchedSink()]).run())
