@@ -20,6 +20,7 @@ from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow, trace
 from streamfeat.kernels.ingest import advance_to_bin, count_events
+from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_DIRTY,
@@ -77,7 +78,7 @@ class Snapshot:
     Attributes:
         fingerprint: of the encoder.
         counts: `(T, H, W)` int32, the ring.
-        atoms: `(V, K)` float32, lasso codes to start from (inverse formulation; else `(V, 0)`).
+        atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
         clock: `(6,)` int64, of which the current bin and the origin matter.
         tally: `(5,)` int64, what was counted.
         encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
@@ -85,7 +86,7 @@ class Snapshot:
 
     fingerprint: str
     counts: NDArray[np.int32]
-    atoms: NDArray[np.float32]
+    atoms: NDArray[np.float64]
     clock: NDArray[np.int64]
     tally: NDArray[np.int64]
     encoded: NDArray[np.int64]
@@ -303,7 +304,7 @@ class Engine:
         return Snapshot(
             fingerprint=self.encoder.fingerprint,
             counts=state.counts.copy(),
-            atoms=state.atoms[state.clock[CLOCK_PLANE]].copy(),
+            atoms=state.atoms[state.clock[CLOCK_PLANE], :, CODE].copy(),
             clock=state.clock.copy(),
             tally=state.tally.copy(),
             encoded=state.encoded.copy(),
@@ -321,17 +322,19 @@ class Engine:
                 f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
                 f"{self.encoder.fingerprint[:12]}"
             )
-        if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != state.atoms.shape[1:]:
+        codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
+        if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != codes.shape:
             raise InputError(
                 f"the snapshot holds a ring of {snapshot.counts.shape} and codes of {snapshot.atoms.shape}, "
-                f"this engine has {state.counts.shape} and {state.atoms.shape[1:]}"
+                f"this engine has {state.counts.shape} and {codes.shape}"
             )
         self.restart(int(snapshot.clock[CLOCK_ORIGIN]))
         state.counts[:] = snapshot.counts
         state.applied[:] = snapshot.counts.clip(-limit, limit)
-        state.atoms[state.clock[CLOCK_PLANE]] = snapshot.atoms
+        codes[:] = snapshot.atoms
         state.clock[[CLOCK_NOW, CLOCK_START]] = snapshot.clock[[CLOCK_NOW, CLOCK_START]]
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
         update(self.grid_shape, self._operator, state)
+        codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
         state.encoded[:] = snapshot.encoded

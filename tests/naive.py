@@ -227,48 +227,65 @@ def _shrunken_gradient_steps(right, penalty, gram, atoms):
     return atoms
 
 
-def solve_lasso(right, square, penalty, gram, gap, start, atoms, residual, active):
-    gram = gram.astype(np.float64)
-    atoms[:] = _shrunken_gradient_steps(right, penalty, gram, start.astype(np.float64))
-    residual[:] = right - gram @ atoms
-    return duality_gap(residual, right, atoms, square, penalty) / max(square / 2, 1e-300)
+def select_atoms(right, atoms, response, least, chosen):
+    found = np.flatnonzero((np.abs(right - response) > least) | (atoms != 0))
+    chosen[: len(found)] = found
+    return len(found)
+
+
+def copy_corner(gram, chosen, corner):
+    corner[:] = 0
+    corner[:, : len(chosen)] = gram[np.ix_(chosen, chosen)]
+
+
+def respond(gram, kept, work, chosen):
+    kept[1] = gram.astype(np.float64) @ kept[0]
+
+
+def solve_lasso(right, square, penalty, gram, gap, kept, work, chosen, corners):
+    kept[0] = _shrunken_gradient_steps(right, penalty, gram.astype(np.float64), kept[0])
+    respond(gram, kept, work, chosen)
+    return duality_gap(right - kept[1], right, kept[0], square, penalty) / max(square / 2, 1e-300)
+
+
+def add_rows(steps, moved, gram, response):
+    response += steps @ gram[moved].astype(np.float64)
 
 
 def subtract_row(step, row, residual):
     residual -= step * row.astype(np.float64)
 
 
-def descend(active, penalty, gram, atoms, residual):
-    gram = gram.astype(np.float64)
-    right = residual + gram @ atoms
-    for j in active:
+def descend(penalty, corner, atoms, residual):
+    n = len(atoms)
+    gram = corner[:, :n].astype(np.float64)
+    right = residual[:n] + gram @ atoms
+    for j in np.flatnonzero(np.diag(gram)):
         rest = atoms.copy()
         rest[j] = 0
         target = right[j] - gram[j] @ rest
         atoms[j] = np.sign(target) * max(abs(target) - penalty, 0) / gram[j, j]
-    residual[:] = right - gram @ atoms
+    residual[:n] = right - gram @ atoms
 
 
-def lasso_code(projection, sigma, square, operator, atoms, work, active):
-    k = len(atoms)
+def lasso_code(projection, sigma, square, operator, kept, work, chosen, corners):
+    k = kept.shape[1]
     right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / operator.unit
-    solution, residual = np.zeros(k), np.zeros(k)
     penalty = operator.threshold / operator.unit
-    solve_lasso(right, square, penalty, operator.gram, operator.gap, atoms, solution, residual, None)
-    atoms[:] = solution
+    solve_lasso(right, square, penalty, operator.gram, operator.gap, kept, None, None, None)
 
 
 def fix_atoms(atoms, operator, code):
     largest = operator.reach * operator.reach / (2 * operator.threshold / operator.unit)
     code[:] = 0
-    code[: len(atoms)] = np.trunc(atoms.astype(np.float64).clip(-largest, largest) * operator.unit)
+    code[: len(atoms)] = np.trunc(atoms.clip(-largest, largest) * operator.unit)
 
 
 def solve_lasso_rows(right, squares, penalty, gram, gap, codes):
     for b, square, code in zip(right.astype(np.float64), squares, codes, strict=True):
-        atoms, residual = np.zeros(len(b)), np.zeros(len(b))
-        solve_lasso(b, square, penalty, gram, gap, code, atoms, residual, None)
-        code[:] = atoms
+        kept = np.array([code, np.zeros(len(b))], np.float64)
+        solve_lasso(b, square, penalty, gram, gap, kept, None, None, None)
+        code[:] = kept[0]
 
 
 # streamfeat.kernels.volume
@@ -363,8 +380,8 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
     square = whitened_square(moments, sigma, operator)
     if operator.inverse:
         if fresh:
-            lasso_code(projection, sigma, square, operator, atoms, None, None)
-        fix_atoms(atoms, operator, code)
+            lasso_code(projection, sigma, square, operator, atoms, None, None, None)
+        fix_atoms(atoms[0], operator, code)
     elif operator.kind == TRIANGLE:
         triangle_code(projection, sigma, square, operator, code)
     else:
@@ -411,12 +428,13 @@ def project_volume(plane, volume, ahead, start, most, part, shape, operator, sta
     return min(most, len(filled)), following
 
 
-def _encode_row(plane, volume, part, shape, operator, state):
+def enter_code(plane, volume, part, shape, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
-    if state.moments[plane, row].any():
-        pool_volume(plane, row, volume, 1, part, shape, operator, state)
-    else:
+    if not state.moments[plane, row].any():
         state.atoms[plane, row] = 0
+        return False
+    pool_volume(plane, row, volume, 1, part, shape, operator, state)
+    return True
 
 
 def complete(part, shape, operator, state):
@@ -426,7 +444,7 @@ def complete(part, shape, operator, state):
         if volume >= cursors[CURSOR_PROJECTED]:
             project_volume(plane, volume, 0, 0, everything, part, shape, operator, state)
         if volume >= cursors[CURSOR_CODED]:
-            _encode_row(plane, volume, part, shape, operator, state)
+            enter_code(plane, volume, part, shape, operator, state)
 
 
 def look_ahead(projected, coded, budget, shape, operator, state):
@@ -446,8 +464,7 @@ def look_ahead(projected, coded, budget, shape, operator, state):
         cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY] = volume, following
     while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
         volume = int(cursors[CURSOR_CODED])
-        _encode_row(plane, volume, part, shape, operator, state)
-        budget -= 6 * state.moments[plane, volume].any()
+        budget -= 6 * enter_code(plane, volume, part, shape, operator, state)
         cursors[CURSOR_CODED] += 1
     return budget
 

@@ -274,7 +274,7 @@ def test_a_restored_engine_goes_on_within_the_gap(kind):
     engine.features()
     other.restore(engine.snapshot())
     np.testing.assert_array_equal(other.snapshot().counts, engine.snapshot().counts)
-    # Solved again from a code that was rounded to float32, which may be just outside the gap.
+    # The response is computed afresh, which may put a code just outside the gap.
     np.testing.assert_allclose(other.snapshot().atoms, engine.snapshot().atoms, atol=1e-4)
     assert_certified(other._operator, other._state)
     other.feed(second)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from streamfeat.kernels.code import deviation, pool, soft_code, triangle_code, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
-from streamfeat.kernels.lasso import fix_atoms, lasso_code
+from streamfeat.kernels.lasso import CODE, fix_atoms, lasso_code
 from streamfeat.kernels.layout import CLOCK_PLANE, MOMENT_SQUARES, SPLIT, TRIANGLE, Operator, State
 
 ADD, TAKE = np.int64(1), np.int64(-1)
@@ -40,7 +40,7 @@ def covering(pixel: int, count: int, operator: Operator) -> tuple[int, int]:
 def encode_volume(
     projection: NDArray[np.int32],
     moments: NDArray[np.int64],
-    atoms: NDArray[np.float32],
+    atoms: NDArray[np.float64],
     fresh: bool,
     part: int,
     operator: Operator,
@@ -51,11 +51,11 @@ def encode_volume(
     Args:
         projection: `(Kp,)` of the volume.
         moments: `(4,)` of the volume.
-        atoms: `(K,)` last lasso code; changed when `fresh`.
+        atoms: `(2, K)` last lasso code and its response; changed when `fresh`.
         fresh: solve the lasso again (True), or show the code that was found last (False).
         part: whose scratch to use.
         operator: the encoder.
-        state: `code`, `work` and `active` of the part are overwritten.
+        state: `code`, `work`, `active` and `corners` of the part are overwritten.
     """
     code = state.code[part]
     if moments[MOMENT_SQUARES] == 0:
@@ -67,8 +67,9 @@ def encode_volume(
     if operator.inverse:
         if fresh:
             square = whitened_square(moments, sigma, operator)
-            lasso_code(projection, sigma, square, operator, atoms, state.work[part], state.active[part])
-        fix_atoms(atoms, operator, code)
+            work, active, corners = state.work[part], state.active[part], state.corners[part]
+            lasso_code(projection, sigma, square, operator, atoms, work, active, corners)
+        fix_atoms(atoms[CODE], operator, code)
     elif operator.kind == TRIANGLE:
         triangle_code(projection, sigma, whitened_square(moments, sigma, operator), operator, code)
     else:

@@ -99,8 +99,9 @@ class State(NamedTuple):
     """`(planes, V, Kp)`: `q` of every volume."""
     moments: NDArray[np.int64]
     """`(planes, V, 4)`: sum of entries, sum of squares, quadratic form, linear form, of every volume."""
-    atoms: NDArray[np.float32]
-    """`(planes, V, K)`: the last lasso code of every volume, from which the next is started."""
+    atoms: NDArray[np.float64]
+    """`(planes, V, 2, K)`: the last lasso code of every volume, from which the next is started, and its
+    response, the Gram matrix times the code."""
     pooled: NDArray[np.int32]
     """`(planes, 4, F)`: fixed-point codes summed over each quadrant. `F` is Kp, or 2 Kp for SPLIT: sums of
     codes, then of their absolute values (the positive and negative parts are half the sum and difference)."""
@@ -111,9 +112,11 @@ class State(NamedTuple):
     code: NDArray[np.int32]
     """`(PARTS, Kp)`: scratch, the fixed-point code of one volume."""
     work: NDArray[np.float64]
-    """`(PARTS, 4, Kp)`: scratch of the lasso."""
+    """`(PARTS, 5, Kp)`: scratch of the lasso."""
     active: NDArray[np.int64]
     """`(PARTS, Kp)`: scratch of the lasso, indices of atoms."""
+    corners: NDArray[np.float32]
+    """`(PARTS, K * Kp)`: scratch of the lasso, a part of the Gram matrix; in memory as far as used."""
     values: NDArray[np.int16]
     """`(PARTS, d)`: scratch, the entries of one volume."""
     entries: NDArray[np.int32]

@@ -14,6 +14,7 @@ import numpy as np
 
 from streamfeat.kernels.compiled import kernel
 from streamfeat.kernels.encode import ADD, lower_half, pool_volume
+from streamfeat.kernels.lasso import respond
 from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_PLANE,
@@ -84,6 +85,33 @@ def project_volume(
 
 
 @kernel
+def enter_code(
+    plane: int, volume: int, part: int, shape: tuple[int, int], operator: Operator, state: State
+) -> bool:
+    """Encode a volume that was projected, and add it to the pooled sums of its plane.
+
+    Args:
+        plane: which plane.
+        volume: which volume. Where the plane has a single row, volumes share it.
+        part: whose scratch to use.
+        shape: rows and columns of the grid of volumes.
+        operator: the encoder.
+        state: `atoms`, `pooled`, `encoded` and scratch are changed.
+
+    Returns:
+        whether the volume had a count, and so a code.
+    """
+    row = min(volume, state.projections.shape[1] - 1)
+    if state.moments[plane, row, MOMENT_SQUARES] == 0:
+        state.atoms[plane, row] = 0
+        return False
+    if operator.inverse:
+        respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
+    pool_volume(plane, row, volume, ADD, part, shape, operator, state)
+    return True
+
+
+@kernel
 def complete(part: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Let all volumes of one part of the grid that are missing enter the current plane.
 
@@ -97,15 +125,11 @@ def complete(part: int, shape: tuple[int, int], operator: Operator, state: State
     cursors, half = state.cursors[plane], lower_half(shape)
     first, last = (0, half) if part == 0 else (half, shape[0] * shape[1])
     for volume in range(max(first, cursors[CURSOR_CODED]), last):
-        row = min(volume, state.projections.shape[1] - 1)
         if volume >= cursors[CURSOR_PROJECTED]:
             start = cursors[CURSOR_ENTRY] if volume == cursors[CURSOR_PROJECTED] else np.int64(0)
             most = state.values.shape[1]
             project_volume(plane, volume, CURRENT, start, most, part, shape, operator, state)
-        if state.moments[plane, row, MOMENT_SQUARES] != 0:
-            pool_volume(plane, row, volume, ADD, part, shape, operator, state)
-        else:
-            state.atoms[plane, row] = 0
+        enter_code(plane, volume, part, shape, operator, state)
 
 
 @kernel
@@ -144,11 +168,6 @@ def look_ahead(
         cursors[CURSOR_PROJECTED] += start == end
         cursors[CURSOR_ENTRY] = 0 if start == end else start
     while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
-        volume = cursors[CURSOR_CODED]
-        if moments[volume, MOMENT_SQUARES] != 0:
-            pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
-            budget -= CODE_COST
-        else:
-            state.atoms[plane, volume] = 0
+        budget -= CODE_COST * enter_code(plane, cursors[CURSOR_CODED], part, shape, operator, state)
         cursors[CURSOR_CODED] += 1
     return budget
