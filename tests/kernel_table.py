@@ -295,7 +295,7 @@ def random_volume(rng, kinds=KINDS):
     values = random_values(rng, operator)
     values[0] = values[0] or 1
     projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
-    projection[:], moments[:] = naive._sums(values, operator)
+    projection[:], moments[:] = naive.sums_of(values, operator)
     return operator, projection, moments
 
 
@@ -345,7 +345,7 @@ def make_move_code(rng):
     operator, projection, moments = random_volume(rng, [kind])
     values = random_values(rng, operator)
     values[0] = values[0] or 1
-    projection[:], moments[:] = naive._sums(values, operator)
+    projection[:], moments[:] = naive.sums_of(values, operator)
     entry, d = int(rng.integers(0, len(values))), len(values)
     before = int(values[entry])
     after = one_step(rng, before, operator)

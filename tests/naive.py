@@ -304,7 +304,7 @@ def change_moments(before, after, moments):
     moments[MOMENT_SQUARES] += int(after) ** 2 - int(before) ** 2
 
 
-def _sums(values, operator):
+def sums_of(values, operator):
     """Projection and moments of a volume, from nothing."""
     v, moments = values.astype(np.int64), np.zeros(4, np.int64)
     moments[MOMENT_SUM], moments[MOMENT_SQUARES] = v.sum(), v @ v
@@ -315,9 +315,9 @@ def _sums(values, operator):
 
 
 def change_entries(n, entries, changes, values, operator, projection, moments):
-    before = _sums(values, operator)
+    before = sums_of(values, operator)
     values[entries[:n]] += changes[:n]
-    after = _sums(values, operator)
+    after = sums_of(values, operator)
     projection += after[0] - before[0]
     moments += after[1] - before[1]
 
@@ -424,7 +424,7 @@ def project_volume(plane, volume, ahead, start, most, part, shape, operator, sta
     end = (len(state.applied) - ahead) * operator.patch**2
     following = int(start + filled[most]) if len(filled) > most else end
     values[following:] = 0
-    state.projections[plane, row], state.moments[plane, row] = _sums(values, operator)
+    state.projections[plane, row], state.moments[plane, row] = sums_of(values, operator)
     return min(most, len(filled)), following
 
 
@@ -498,7 +498,7 @@ def _follow_volume(plane, volume, values, part, shape, operator, state):
     coded = volume < state.cursors[plane, CURSOR_CODED]
     if coded:
         pool_volume(plane, volume, volume, -1, part, shape, operator, state)
-    state.projections[plane, volume], state.moments[plane, volume] = _sums(values, operator)
+    state.projections[plane, volume], state.moments[plane, volume] = sums_of(values, operator)
     if coded:
         pool_volume(plane, volume, volume, 1, part, shape, operator, state)
 

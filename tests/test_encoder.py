@@ -231,8 +231,7 @@ def test_no_code_and_no_number_on_the_way_to_it_exceeds_the_largest(kind, max_co
         for values in extreme_volumes(rng, operator, geometry):
             if not values.any():
                 continue
-            projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
-            naive.project_volume(values.astype(np.int16), operator, projection, moments)
+            projection, moments = naive.sums_of(values, operator)
             sigma = naive.deviation(moments, geometry.entries, eps)
             numbers = np.abs(naive._scores(projection, sigma, operator)).max()
             if operator.quadratic.size:

@@ -7,10 +7,12 @@ import naive
 import numpy as np
 import pytest
 from kernel_table import KERNELS, Run, copied
+from numba.core.errors import NumbaError
 from numba.core.registry import CPUDispatcher
 
 from streamfeat import kernels
-from streamfeat.kernels.lasso import duality_gap
+from streamfeat.kernels import compiled
+from streamfeat.kernels.lasso import duality_gap, solve_lasso_rows
 
 ROUNDS = 50
 
@@ -40,6 +42,16 @@ def test_every_kernel_has_a_row_and_a_twin():
     names = sorted(all_kernels())
     assert sorted(row.name for row in KERNELS) == names
     assert [name for name in names if not hasattr(naive, name)] == []
+
+
+def test_no_kernel_on_the_way_of_an_event_can_allocate():
+    on_the_way = [row.kernel for row in KERNELS if row.kernel is not solve_lasso_rows]
+    assert all(kernel.targetoptions["_nrt"] is False for kernel in on_the_way)
+
+
+def test_a_kernel_that_allocates_does_not_compile():
+    with pytest.raises(NumbaError, match="NRT"):
+        compiled.kernel(lambda n: np.zeros(n))(3)
 
 
 def test_duality_gap_is_what_primal_and_dual_objective_differ_by():
