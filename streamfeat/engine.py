@@ -265,7 +265,7 @@ class Engine:
         codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
         for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
             encode_volume(projection, moments, atoms, False, 0, operator, state)
-            code[:] = state.code[0, : operator.n_filters] / operator.unit
+            code[:] = state.code[0, 0, : operator.n_filters] / operator.unit
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
     @property

@@ -69,7 +69,7 @@ def allocate_state(
         pooled=np.zeros((planes, 4, features), np.int32),
         dirty=np.zeros(planes * volumes, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
-        code=np.zeros((PARTS, padded), np.int32),
+        code=np.zeros((PARTS, 2, padded), np.int32),
         work=np.zeros((PARTS, 5, padded), np.float64),
         active=np.zeros((PARTS, padded), np.int64),
         values=np.zeros((PARTS, geometry.entries), np.int16),

@@ -80,6 +80,11 @@ def exact(kernel: Run, twin: Run) -> None:
         assert_same(mine, yours)
 
 
+def exact_but_codes(kernel: Run, twin: Run) -> None:
+    """All but the last argument, which is scratch."""
+    exact(*(Run(run.before[:-1], run.after[:-1], run.result) for run in (kernel, twin)))
+
+
 def exact_but_scratch(kernel: Run, twin: Run) -> None:
     assert_same(kernel.result, twin.result)
     for mine, yours in zip(kernel.after, twin.after, strict=True):
@@ -128,7 +133,7 @@ def in_planes(state):
 
 def assert_pooled(shape, operator, state):
     """What is pooled are the codes that are there."""
-    pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code[0])
+    pooled, fixed = np.zeros_like(state.pooled), np.zeros_like(state.code[0, 0])
     for plane, row in in_planes(state):
         naive.fix_atoms(state.atoms[plane, row, 0], operator, fixed)
         naive.pool(fixed, 1, operator.kind, pooled[plane, naive.quadrant(row, shape)])
@@ -340,21 +345,40 @@ def one_step(rng, before, operator):
     return int(pick(rng, [count for count in (before - 1, before + 1) if -limit <= count <= limit]))
 
 
-def make_move_code(rng):
-    kind = pick(rng, [("direct", "soft"), ("direct", "split")])
-    operator, projection, moments = random_volume(rng, [kind])
+def random_move(rng, kinds):
+    """A volume that is not empty and an entry that changes: operator, projection, sigmas, squares, change."""
+    operator, *_ = random_volume(rng, kinds)
     values = random_values(rng, operator)
     values[0] = values[0] or 1
-    projection[:], moments[:] = naive.sums_of(values, operator)
-    entry, d = int(rng.integers(0, len(values))), len(values)
-    before = int(values[entry])
-    after = one_step(rng, before, operator)
-    sigma = naive.deviation(moments, d, operator.eps)
-    naive.change_moments(before, after, moments)
+    entry = int(rng.integers(0, len(values)))
+    after = values.copy()
+    after[entry] = one_step(rng, int(values[entry]), operator)
+    sums = [naive.sums_of(v, operator) for v in (values, after)]
+    sigmas = tuple(naive.deviation(moments, len(values), operator.eps) for _, moments in sums)
+    squares = tuple(naive.whitened_square(m[1], s, operator) for m, s in zip(sums, sigmas, strict=True))
+    change = int(after[entry]) - int(values[entry])
+    return operator, sums[0][0], sigmas, squares, change, operator.columns[entry]
+
+
+def make_move_code(rng):
+    kind = pick(rng, [("direct", "soft"), ("direct", "split")])
+    operator, projection, sigmas, _, change, column = random_move(rng, [kind])
     width = len(projection) * (2 if operator.kind == SPLIT else 1)
     pooled = rng.integers(-(2**30), 2**30, width).astype(np.int32)
-    sigmas = sigma, naive.deviation(moments, d, operator.eps)
-    return after - before, operator.columns[entry], projection, *sigmas, operator, pooled
+    return change, column, projection, *sigmas, operator, pooled
+
+
+def make_move_triangle(rng):
+    operator, projection, sigmas, squares, change, column = random_move(rng, [("direct", "triangle")])
+    pooled = rng.integers(-(2**30), 2**30, len(projection)).astype(np.int32)
+    codes = np.zeros((2, len(projection)), np.int32)
+    return change, column, projection, sigmas, squares, operator, pooled, codes
+
+
+def make_fixed_distance(rng):
+    z, length, norm = (np.float32(value) for value in rng.normal(size=3) ** 2)
+    unit = np.float32(2.0 ** int(rng.integers(8, 17)))
+    return z * unit, length, norm, unit
 
 
 def make_evt3(rng):
@@ -558,7 +582,7 @@ def rewind(rng, plane, shape, operator, state):
     for row in range(coded):
         row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
         naive.encode_volume(*row_of, False, 0, operator, state)
-        naive.pool(state.code[0], 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
+        naive.pool(state.code[0, 0], 1, operator.kind, state.pooled[plane, naive.quadrant(row, shape)])
 
 
 def random_most(rng):
@@ -650,9 +674,12 @@ def changed_place(rng, operator, state):
     return place
 
 
-def make_change_volume(rng):
-    shape, operator, state = parts_of(read_engine(rng, EXACT_KINDS))
-    plane, volume = random_row(rng, state)
+def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False):
+    shape, operator, state = parts_of(read_engine(rng, kinds))
+    places = [place for place in in_planes(state) if not stays or state.moments[place][MOMENT_SQUARES] > 0]
+    if not places:
+        return make_change_volume(rng, kinds, stays=stays)
+    plane, volume = pick(rng, places)
     ahead = int(plane != state.clock[CLOCK_PLANE])
     values = naive._gather(state.applied, ahead, volume, shape, operator, state)
     state.values[0] = values
@@ -660,7 +687,14 @@ def make_change_volume(rng):
     anywhere = len(filled) == 0 or rng.random() < 0.5
     entry = int(rng.integers(0, len(values)) if anywhere else pick(rng, filled))
     before = int(values[entry])
-    return plane, volume, entry, one_step(rng, before, operator) - before, shape, operator, state
+    after = one_step(rng, before, operator)
+    if stays and len(filled) == 1 and after == 0:
+        return make_change_volume(rng, kinds, stays=stays)
+    return plane, volume, entry, after - before, shape, operator, state
+
+
+def make_move_volume(rng):
+    return make_change_volume(rng, [kind for kind in EXACT_KINDS if kind[0] == "direct"], stays=True)
 
 
 def make_change_place(rng):
@@ -704,8 +738,9 @@ def make_add_column(rng):
 
 
 def make_change_moments(rng):
-    _, _, moments = random_volume(rng)
-    return *(int(count) for count in rng.integers(-100, 101, 2)), moments
+    operator, _, moments = random_volume(rng)
+    values = random_values(rng, operator).clip(-100, 100)
+    return int(rng.integers(0, len(values))), int(rng.integers(-9, 10)), values, operator, moments
 
 
 def make_add_columns(rng):
@@ -790,6 +825,8 @@ KERNELS = [
     Row(code.triangle_code, make_triangle_code),
     Row(code.pool, make_pool),
     Row(code.move_code, make_move_code),
+    Row(code.move_triangle, make_move_triangle, exact_but_codes),
+    Row(code.fixed_distance, make_fixed_distance),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
@@ -823,6 +860,7 @@ KERNELS = [
     Row(update.update, make_update, exact_but_atoms),
     Row(update.read, make_read, exact_but_features),
     Row(follow.change_volume, make_change_volume, exact_but_scratch),
+    Row(follow.move_volume, make_move_volume, exact_but_scratch),
     Row(follow.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),

@@ -143,6 +143,19 @@ def move_code(change, column, projection, sigma_before, sigma_after, operator, p
     pool(code, 1, operator.kind, pooled)
 
 
+def fixed_distance(z, length, square_norm, unit):
+    square = np.float32(length) - np.float32(2) * (np.float32(z) / np.float32(unit)) + np.float32(square_norm)
+    return int(np.sqrt(np.maximum(square, np.float32(0))) * np.float32(unit))
+
+
+def move_triangle(change, column, projection, sigmas, squares, operator, pooled, codes):
+    triangle_code(projection, sigmas[0], squares[0], operator, codes[0])
+    pool(codes[0], -1, operator.kind, pooled)
+    add_column(change, column, projection)
+    triangle_code(projection, sigmas[1], squares[1], operator, codes[0])
+    pool(codes[0], 1, operator.kind, pooled)
+
+
 # streamfeat.kernels.ingest
 
 
@@ -299,11 +312,6 @@ def add_columns(n, entries, changes, columns, projection):
     projection += changes[:n].astype(np.int64) @ columns[entries[:n]].astype(np.int64)
 
 
-def change_moments(before, after, moments):
-    moments[MOMENT_SUM] += int(after) - int(before)
-    moments[MOMENT_SQUARES] += int(after) ** 2 - int(before) ** 2
-
-
 def sums_of(values, operator):
     """Projection and moments of a volume, from nothing."""
     v, moments = values.astype(np.int64), np.zeros(4, np.int64)
@@ -312,6 +320,13 @@ def sums_of(values, operator):
         moments[MOMENT_QUADRATIC] = v @ operator.quadratic.astype(np.int64) @ v
         moments[MOMENT_LINEAR] = v @ operator.linear.astype(np.int64)
     return (v @ operator.columns.astype(np.int64)).astype(np.int32), moments
+
+
+def change_moments(entry, change, values, operator, moments):
+    _, before = sums_of(values, operator)
+    values[entry] += change
+    _, after = sums_of(values, operator)
+    moments += after - before
 
 
 def change_entries(n, entries, changes, values, operator, projection, moments):
@@ -370,7 +385,7 @@ def covering(pixel, count, operator):
 
 
 def encode_volume(projection, moments, atoms, fresh, part, operator, state):
-    code = state.code[part]
+    code = state.code[part, 0]
     if moments[MOMENT_SQUARES] == 0:
         code[:] = 0
         if fresh:
@@ -391,7 +406,7 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
 def pool_volume(plane, row, volume, sign, part, shape, operator, state):
     row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
     encode_volume(*row_of, sign > 0, part, operator, state)
-    pool(state.code[part], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+    pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
     state.encoded[part] += sign > 0
 
 
@@ -557,6 +572,10 @@ def change_volume(plane, volume, entry, change, shape, operator, state):
     values[_entries_in(plane, volume, state) :] = 0
     values[entry] += change
     _follow_volume(plane, volume, values, 0, shape, operator, state)
+
+
+def move_volume(plane, volume, entry, change, shape, operator, state):
+    change_volume(plane, volume, entry, change, shape, operator, state)
 
 
 def change_place(place, shape, operator, state):

@@ -70,22 +70,32 @@ def triangle_code(
         operator: scale, offset and squared norms.
         code: `(Kp,)`, overwritten; zero beyond `n_filters`.
     """
-    n_filters = operator.n_filters
-    gain = np.float32(operator.scale * operator.unit / sigma)
-    one = np.float32(operator.unit)
-    two = np.float32(2.0)
-    zero = np.float32(0.0)
-    length = np.float32(square)
+    n_filters, unit = operator.n_filters, np.float32(operator.unit)
+    gain, length = np.float32(operator.scale * operator.unit / sigma), np.float32(square)
     total = np.int64(0)
     for k in range(n_filters):
-        z = (np.float32(projection[k]) * gain - operator.offset[k]) / one
-        distance = np.sqrt(max(length - two * z + operator.square_norms[k], zero))
-        code[k] = np.int32(distance * one)
+        z = np.float32(projection[k]) * gain - operator.offset[k]
+        code[k] = fixed_distance(z, length, operator.square_norms[k], unit)
         total += code[k]
     mean = np.int32(total // n_filters)
     for k in range(n_filters):
         code[k] = max(mean - code[k], 0)
     code[n_filters:] = 0
+
+
+@inlined
+def fixed_distance(z: np.float32, length: np.float32, square_norm: np.float32, unit: np.float32) -> np.int32:
+    """Distance of a volume from a filter, `sqrt(|x|^2 - 2 a.x + |a|^2)`, in fixed point.
+
+    Args:
+        z: `a.x`, times `unit`.
+        length: `|x|^2`.
+        square_norm: `|a|^2`.
+        unit: of the fixed point, a power of two.
+    """
+    # Dividing by a power of two is exact, and so is multiplying by what it leaves of one.
+    square = length - z * (np.float32(2.0) / unit) + square_norm
+    return np.int32(np.sqrt(max(square, np.float32(0.0))) * unit)
 
 
 @kernel
@@ -149,3 +159,46 @@ def move_code(
         sums[k] += new - old
         if split:
             sizes[k] += abs(new) - abs(old)
+
+
+@inlined
+def move_triangle(
+    change: int,
+    column: NDArray[np.int16],
+    projection: NDArray[np.int32],
+    sigmas: tuple[float, float],
+    squares: tuple[float, float],
+    operator: Operator,
+    pooled: NDArray[np.int32],
+    codes: NDArray[np.int32],
+) -> None:
+    """The same as `move_code` for the triangle encoding: distances in one run, the mean of them, codes.
+
+    Args:
+        change: of the clipped count, 1 or -1.
+        column: `(Kp,)` of the entry.
+        projection: `(Kp,)` of the volume, changed.
+        sigmas: standard deviations of the volume before the change and after it.
+        squares: `|x|^2` of the whitened volume before the change and after it.
+        operator: scale, offset and squared norms.
+        pooled: `(F,)` of the volume's quadrant, changed.
+        codes: `(2, Kp)` scratch.
+    """
+    n_filters, unit = operator.n_filters, np.float32(operator.unit)
+    before = np.float32(operator.scale * operator.unit / sigmas[0])
+    after = np.float32(operator.scale * operator.unit / sigmas[1])
+    length_before, length_after = np.float32(squares[0]), np.float32(squares[1])
+    offset, norms, old, new = operator.offset, operator.square_norms, codes[0], codes[1]
+    step = np.int32(change)
+    total_before, total_after = np.int64(0), np.int64(0)
+    for k in range(n_filters):
+        q = projection[k]
+        moved = np.int32(q + step * np.int32(column[k]))
+        projection[k] = moved
+        old[k] = fixed_distance(np.float32(q) * before - offset[k], length_before, norms[k], unit)
+        new[k] = fixed_distance(np.float32(moved) * after - offset[k], length_after, norms[k], unit)
+        total_before += old[k]
+        total_after += new[k]
+    mean_before, mean_after = np.int32(total_before // n_filters), np.int32(total_after // n_filters)
+    for k in range(n_filters):
+        pooled[k] += max(mean_after - new[k], 0) - max(mean_before - old[k], 0)

@@ -46,7 +46,7 @@ def encode_volume(
     operator: Operator,
     state: State,
 ) -> None:
-    """Write the code of a volume to `state.code[part]`; a volume whose counts are all zero has code zero.
+    """Write the code of a volume to `state.code[part, 0]`; a volume whose counts are all zero has code zero.
 
     Args:
         projection: `(Kp,)` of the volume.
@@ -57,7 +57,7 @@ def encode_volume(
         operator: the encoder.
         state: `code`, `work`, `active` and `corners` of the part are overwritten.
     """
-    code = state.code[part]
+    code = state.code[part, 0]
     if moments[MOMENT_SQUARES] == 0:
         if fresh:
             atoms[:] = 0
@@ -106,7 +106,7 @@ def pool_volume(
     if fresh:
         state.encoded[part] += 1
     if moments[MOMENT_SQUARES] != 0:
-        pool(state.code[part], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+        pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
 
 
 @kernel

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.events import Events
-from streamfeat.kernels.code import deviation, move_code
+from streamfeat.kernels.code import deviation, move_code, move_triangle, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant, read_features
 from streamfeat.kernels.ingest import UNCHANGED, count_event
@@ -74,6 +74,30 @@ def change_volume(
 
 
 @inlined
+def move_volume(
+    plane: int, volume: int, entry: int, change: int, shape: tuple[int, int], operator: Operator, state: State
+) -> None:
+    """The same for a volume that has a code in closed form and is not empty before or after, in one run.
+
+    Args: as for `change_volume`.
+    """
+    projection, moments = state.projections[plane, volume], state.moments[plane, volume]
+    pooled, column = state.pooled[plane, quadrant(volume, shape)], operator.columns[entry]
+    entries, eps = operator.columns.shape[0], operator.eps
+    sigma = deviation(moments, entries, eps)
+    if operator.kind == TRIANGLE:
+        square = whitened_square(moments, sigma, operator)
+        change_moments(entry, change, state.values[0], operator, moments)
+        sigmas = sigma, deviation(moments, entries, eps)
+        squares = square, whitened_square(moments, sigmas[1], operator)
+        move_triangle(change, column, projection, sigmas, squares, operator, pooled, state.code[0])
+    else:
+        change_moments(entry, change, state.values[0], operator, moments)
+        move_code(change, column, projection, sigma, deviation(moments, entries, eps), operator, pooled)
+    state.encoded[0] += 1
+
+
+@inlined
 def change_place(place: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
@@ -91,7 +115,6 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
     row, column = place // width % height, place % width
     first_row, last_row = covering(row, shape[0], operator)
     first_column, last_column = covering(column, shape[1], operator)
-    fused = not operator.inverse and operator.kind != TRIANGLE
     for plane in range(state.cursors.shape[0]):
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
         # The oldest bin of the window is at position 0 of a volume.
@@ -107,23 +130,6 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
                 entry = (position * patch + row - top) * patch + column - left
                 if volume > projected or (volume == projected and entry >= last_entry):
                     continue
-                moments = state.moments[plane, volume]
-                squares = moments[MOMENT_SQUARES]
-                if fused and volume < coded and squares and squares + after * after > before * before:
-                    entries = operator.columns.shape[0]
-                    sigma = deviation(moments, entries, operator.eps)
-                    change_moments(before, after, moments)
-                    move_code(
-                        after - before,
-                        operator.columns[entry],
-                        state.projections[plane, volume],
-                        sigma,
-                        deviation(moments, entries, operator.eps),
-                        operator,
-                        state.pooled[plane, quadrant(volume, shape)],
-                    )
-                    state.encoded[0] += 1
-                    continue
                 if operator.quadratic.shape[0]:
                     end = (n_bins - ahead) * patch * patch
                     if volume == projected:
@@ -131,7 +137,12 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
                     first_slot = (now + 1 + ahead) % n_bins
                     gather_volume(state.applied, first_slot, end, top, left, patch, state.values[0])
                 state.values[0, entry] = before
-                change_volume(plane, volume, entry, after - before, shape, operator, state)
+                squares = state.moments[plane, volume, MOMENT_SQUARES]
+                stays = squares != 0 and squares + after * after > before * before
+                if stays and volume < coded and not operator.inverse:
+                    move_volume(plane, volume, entry, after - before, shape, operator, state)
+                else:
+                    change_volume(plane, volume, entry, after - before, shape, operator, state)
     applied[place] = after
 
 

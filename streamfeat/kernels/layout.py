@@ -110,7 +110,7 @@ class State(NamedTuple):
     is_dirty: NDArray[np.uint8]
     """`(planes * V,)`: whether a volume is on that stack."""
     code: NDArray[np.int32]
-    """`(PARTS, Kp)`: scratch, the fixed-point code of one volume."""
+    """`(PARTS, 2, Kp)`: scratch, fixed-point codes of one volume."""
     work: NDArray[np.float64]
     """`(PARTS, 5, Kp)`: scratch of the lasso."""
     active: NDArray[np.int64]

@@ -58,10 +58,34 @@ def add_columns(
 
 
 @inlined
-def change_moments(before: int, after: int, moments: NDArray[np.int64]) -> None:
-    """Let one entry of a volume change in the sum and in the sum of squares."""
-    moments[MOMENT_SUM] += after - before
-    moments[MOMENT_SQUARES] += after * after - before * before
+def change_moments(
+    entry: int,
+    change: int,
+    values: NDArray[np.int16],
+    operator: Operator,
+    moments: NDArray[np.int64],
+) -> None:
+    """Let one entry of a volume change, and the moments with it.
+
+    Args:
+        entry: index into the volume, bin-major.
+        change: of its clipped count.
+        values: `(d,)` clipped counts, changed. Only this entry has to be right, unless the operator has a
+            quadratic form.
+        operator: forms.
+        moments: `(4,)`, changed.
+    """
+    before = np.int64(values[entry])
+    moments[MOMENT_SUM] += change
+    moments[MOMENT_SQUARES] += change * (2 * before + change)
+    if operator.quadratic.shape[0]:
+        form = operator.quadratic[entry]
+        product = np.int64(0)
+        for j in range(values.shape[0]):
+            product += np.int64(form[j]) * values[j]
+        moments[MOMENT_QUADRATIC] += change * (2 * product + change * np.int64(form[entry]))
+        moments[MOMENT_LINEAR] += change * np.int64(operator.linear[entry])
+    values[entry] = before + change
 
 
 @kernel
@@ -88,17 +112,7 @@ def change_entries(
     """
     add_columns(n, entries, changes, operator.columns, projection)
     for i in range(n):
-        entry, change = entries[i], np.int64(changes[i])
-        before = np.int64(values[entry])
-        change_moments(before, before + change, moments)
-        if operator.quadratic.shape[0]:
-            form = operator.quadratic[entry]
-            product = np.int64(0)
-            for j in range(values.shape[0]):
-                product += np.int64(form[j]) * values[j]
-            moments[MOMENT_QUADRATIC] += change * (2 * product + change * np.int64(form[entry]))
-            moments[MOMENT_LINEAR] += change * np.int64(operator.linear[entry])
-        values[entry] = before + change
+        change_moments(entries[i], np.int64(changes[i]), values, operator, moments)
 
 
 @kernel
