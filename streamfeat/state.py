@@ -56,7 +56,7 @@ def allocate_state(
     return State(
         counts=np.zeros(ring, np.int32),
         applied=np.zeros(ring, np.int16),
-        touched=np.zeros(int(np.prod(ring)), np.int32),
+        touched=np.zeros(int(np.prod(ring)) + 1, np.int32),
         is_touched=np.zeros(ring, np.uint8),
         touched_slots=np.zeros(geometry.n_bins, np.uint8),
         clock=clock,

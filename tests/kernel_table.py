@@ -19,6 +19,7 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CLOCK_TOUCHED,
     CURSOR_CODED,
     CURSOR_PROJECTED,
     LANES,
@@ -83,6 +84,14 @@ def exact(kernel: Run, twin: Run) -> None:
 def exact_but_codes(kernel: Run, twin: Run) -> None:
     """All but the last argument, which is scratch."""
     exact(*(Run(run.before[:-1], run.after[:-1], run.result) for run in (kernel, twin)))
+
+
+def exact_below_the_top(kernel: Run, twin: Run) -> None:
+    """All but what lies above the touched stack."""
+    for run in (kernel, twin):
+        state = run.after[-1]
+        state.touched[state.clock[CLOCK_TOUCHED] :] = 0
+    exact(kernel, twin)
 
 
 def exact_but_scratch(kernel: Run, twin: Run) -> None:
@@ -363,16 +372,32 @@ def random_move(rng, kinds):
 def make_move_code(rng):
     kind = pick(rng, [("direct", "soft"), ("direct", "split")])
     operator, projection, sigmas, _, change, column = random_move(rng, [kind])
+    gains = (naive.gain(sigma, operator) for sigma in sigmas)
     width = len(projection) * (2 if operator.kind == SPLIT else 1)
     pooled = rng.integers(-(2**30), 2**30, width).astype(np.int32)
-    return change, column, projection, *sigmas, operator, pooled
+    threshold = np.float32(operator.threshold)
+    return change, column, projection, *gains, operator.offset, threshold, operator.kind, pooled
 
 
 def make_move_triangle(rng):
     operator, projection, sigmas, squares, change, column = random_move(rng, [("direct", "triangle")])
+    gains, lengths = tuple(naive.gain(s, operator) for s in sigmas), tuple(np.float32(s) for s in squares)
     pooled = rng.integers(-(2**30), 2**30, len(projection)).astype(np.int32)
-    codes = np.zeros((2, len(projection)), np.int32)
-    return change, column, projection, sigmas, squares, operator, pooled, codes
+    codes, unit = np.zeros((2, len(projection)), np.int32), np.float32(operator.unit)
+    arrays = operator.offset, operator.square_norms, operator.n_filters, unit, pooled, codes
+    return change, column, projection, gains, lengths, *arrays
+
+
+def make_gain(rng):
+    return float(rng.random() + 0.1), random_engine(rng)._operator
+
+
+def make_mean_distance(rng):
+    return rng.integers(0, 2**30, 33).astype(np.int32), int(rng.integers(1, 34))
+
+
+def make_current_slot(rng):
+    return (parts_of(random_engine(rng))[2],)
 
 
 def make_fixed_distance(rng):
@@ -827,11 +852,14 @@ KERNELS = [
     Row(code.move_code, make_move_code),
     Row(code.move_triangle, make_move_triangle, exact_but_codes),
     Row(code.fixed_distance, make_fixed_distance),
+    Row(code.mean_distance, make_mean_distance),
+    Row(code.gain, make_gain),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),
-    Row(ingest.count_events, make_count_events),
+    Row(ingest.current_slot, make_current_slot),
+    Row(ingest.count_events, make_count_events, exact_below_the_top),
     Row(lasso.duality_gap, make_duality_gap, close),
     Row(lasso.solve_lasso, make_solve_lasso, lasso_within_gap),
     Row(lasso.subtract_row, make_subtract_row),

@@ -108,9 +108,12 @@ def whitened_square(moments, sigma, operator):
     return float(np.clip(quadratic - 2 * linear + operator.constant, 0, operator.reach * operator.reach))
 
 
+def gain(sigma, operator):
+    return np.float32(operator.scale * operator.unit / sigma)
+
+
 def _scores(projection, sigma, operator):
-    gain = np.float32(operator.scale * operator.unit / sigma)
-    return projection.astype(np.float32) * gain - operator.offset
+    return projection.astype(np.float32) * gain(sigma, operator) - operator.offset
 
 
 def soft_code(projection, sigma, operator, code):
@@ -134,13 +137,19 @@ def pool(code, sign, kind, pooled):
     pooled += sign * np.concatenate(parts)
 
 
-def move_code(change, column, projection, sigma_before, sigma_after, operator, pooled):
-    code = np.zeros(len(projection), np.int32)
-    soft_code(projection, sigma_before, operator, code)
-    pool(code, -1, operator.kind, pooled)
+def _soft(projection, factor, offset, threshold):
+    z = projection.astype(np.float32) * factor - offset
+    return (np.sign(z) * np.maximum(np.abs(z) - threshold, np.float32(0))).astype(np.int32)
+
+
+def move_code(change, column, projection, gain_before, gain_after, offset, threshold, kind, pooled):
+    pool(_soft(projection, gain_before, offset, threshold), -1, kind, pooled)
     add_column(change, column, projection)
-    soft_code(projection, sigma_after, operator, code)
-    pool(code, 1, operator.kind, pooled)
+    pool(_soft(projection, gain_after, offset, threshold), 1, kind, pooled)
+
+
+def mean_distance(distances, n_filters):
+    return int(distances[:n_filters].sum(dtype=np.int64)) // n_filters
 
 
 def fixed_distance(z, length, square_norm, unit):
@@ -148,12 +157,16 @@ def fixed_distance(z, length, square_norm, unit):
     return int(np.sqrt(np.maximum(square, np.float32(0))) * np.float32(unit))
 
 
-def move_triangle(change, column, projection, sigmas, squares, operator, pooled, codes):
-    triangle_code(projection, sigmas[0], squares[0], operator, codes[0])
-    pool(codes[0], -1, operator.kind, pooled)
-    add_column(change, column, projection)
-    triangle_code(projection, sigmas[1], squares[1], operator, codes[0])
-    pool(codes[0], 1, operator.kind, pooled)
+def move_triangle(change, column, projection, gains, lengths, offset, norms, n_filters, unit, pooled, codes):
+    k = n_filters
+    for sign, factor, length in zip((-1, 1), gains, lengths, strict=True):
+        if sign == 1:
+            add_column(change, column, projection)
+        z = (projection.astype(np.float32) * factor - offset)[:k]
+        distances = np.array(
+            [fixed_distance(*pair, unit) for pair in zip(z, [length] * k, norms[:k], strict=True)]
+        )
+        pooled[:k] += sign * np.maximum(mean_distance(distances, k) - distances, 0)
 
 
 # streamfeat.kernels.ingest
@@ -199,6 +212,14 @@ def count_event(x, y, p, t, height, width, operator, state):
         tally[TALLY_SATURATED] += 1
         return -1
     return int(np.ravel_multi_index(entry, counts.shape))
+
+
+def current_slot(state):
+    now = int(state.clock[CLOCK_NOW])
+    if now == BEFORE_TIME:
+        return 2**62, 0
+    n_bins, *slot = state.counts.shape
+    return int(state.clock[CLOCK_START]), now % n_bins * math.prod(slot)
 
 
 def count_events(events, height, width, operator, state):

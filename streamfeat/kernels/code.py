@@ -30,6 +30,12 @@ def deviation(moments: NDArray[np.int64], entries: int, eps: float) -> float:
     return math.sqrt(moments[MOMENT_SQUARES] / entries - mean * mean + eps)
 
 
+@inlined
+def gain(sigma: float, operator: Operator) -> np.float32:
+    """What a projection is multiplied with, to be normalised and in fixed point: `z = q gain - offset`."""
+    return np.float32(operator.scale * operator.unit / sigma)
+
+
 @kernel
 def whitened_square(moments: NDArray[np.int64], sigma: float, operator: Operator) -> float:
     """`|x|^2` of a volume, from its quadratic and linear form; from 0 to the square of `operator.reach`."""
@@ -46,10 +52,9 @@ def soft_code(
 
     Kostadinov and Scaramuzza, ICPR 2020/21, direct problem formulation, sparse coding step.
     """
-    gain = np.float32(operator.scale * operator.unit / sigma)
-    threshold = np.float32(operator.threshold)
+    factor, threshold = gain(sigma, operator), np.float32(operator.threshold)
     for k in range(code.shape[0]):
-        z = np.float32(projection[k]) * gain - operator.offset[k]
+        z = np.float32(projection[k]) * factor - operator.offset[k]
         code[k] = np.int32(z - min(max(z, -threshold), threshold))
 
 
@@ -71,16 +76,23 @@ def triangle_code(
         code: `(Kp,)`, overwritten; zero beyond `n_filters`.
     """
     n_filters, unit = operator.n_filters, np.float32(operator.unit)
-    gain, length = np.float32(operator.scale * operator.unit / sigma), np.float32(square)
-    total = np.int64(0)
+    factor, length = gain(sigma, operator), np.float32(square)
     for k in range(n_filters):
-        z = np.float32(projection[k]) * gain - operator.offset[k]
+        z = np.float32(projection[k]) * factor - operator.offset[k]
         code[k] = fixed_distance(z, length, operator.square_norms[k], unit)
-        total += code[k]
-    mean = np.int32(total // n_filters)
+    mean = mean_distance(code, n_filters)
     for k in range(n_filters):
         code[k] = max(mean - code[k], 0)
     code[n_filters:] = 0
+
+
+@inlined
+def mean_distance(distances: NDArray[np.int32], n_filters: int) -> np.int32:
+    """Mean of the first `n_filters` distances, rounded down."""
+    total = np.int64(0)
+    for k in range(n_filters):
+        total += distances[k]
+    return np.int32(total // n_filters)
 
 
 @inlined
@@ -116,14 +128,16 @@ def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32
             pooled[width + k] += sign * abs(code[k])
 
 
-@inlined
+@kernel
 def move_code(
     change: int,
     column: NDArray[np.int16],
     projection: NDArray[np.int32],
-    sigma_before: float,
-    sigma_after: float,
-    operator: Operator,
+    gain_before: np.float32,
+    gain_after: np.float32,
+    offset: NDArray[np.float32],
+    threshold: np.float32,
+    kind: int,
     pooled: NDArray[np.int32],
 ) -> None:
     """One entry of a volume changes: projection, soft code and pooled sums follow in one run over memory.
@@ -135,40 +149,42 @@ def move_code(
         change: of the clipped count, 1 or -1.
         column: `(Kp,)` of the entry.
         projection: `(Kp,)` of the volume, changed.
-        sigma_before: standard deviation of the volume before the change.
-        sigma_after: and after it.
-        operator: scale, offset and threshold.
+        gain_before: of the volume before the change, see `gain`.
+        gain_after: and after it.
+        offset: `(Kp,)` of the operator.
+        threshold: of the operator.
+        kind: SOFT or SPLIT.
         pooled: `(F,)` of the volume's quadrant, changed.
     """
-    before = np.float32(operator.scale * operator.unit / sigma_before)
-    after = np.float32(operator.scale * operator.unit / sigma_after)
-    threshold = np.float32(operator.threshold)
     width = projection.shape[0]
-    offset, sums, sizes = operator.offset, pooled[:width], pooled[width:]
-    # Conditions that hold for the whole run: the compiler makes a loop for each case. A product of column and
-    # change instead would be the slowest instruction of them all.
-    up, split = change > 0, operator.kind == SPLIT
+    sums, sizes = pooled[:width], pooled[width:]
+    # Conditions that hold for the whole run: the compiler makes a loop for each case, in a function as small
+    # as this. A product of column and change would be the slowest instruction of them all.
+    up, split = change > 0, kind == SPLIT
     for k in range(width):
         q, c = projection[k], np.int32(column[k])
         moved = np.int32(q + c) if up else np.int32(q - c)
         projection[k] = moved
-        z = np.float32(q) * before - offset[k]
+        z = np.float32(q) * gain_before - offset[k]
         old = np.int32(z - min(max(z, -threshold), threshold))
-        z = np.float32(moved) * after - offset[k]
+        z = np.float32(moved) * gain_after - offset[k]
         new = np.int32(z - min(max(z, -threshold), threshold))
         sums[k] += new - old
         if split:
             sizes[k] += abs(new) - abs(old)
 
 
-@inlined
+@kernel
 def move_triangle(
     change: int,
     column: NDArray[np.int16],
     projection: NDArray[np.int32],
-    sigmas: tuple[float, float],
-    squares: tuple[float, float],
-    operator: Operator,
+    gains: tuple[np.float32, np.float32],
+    lengths: tuple[np.float32, np.float32],
+    offset: NDArray[np.float32],
+    norms: NDArray[np.float32],
+    n_filters: int,
+    unit: np.float32,
     pooled: NDArray[np.int32],
     codes: NDArray[np.int32],
 ) -> None:
@@ -178,27 +194,22 @@ def move_triangle(
         change: of the clipped count, 1 or -1.
         column: `(Kp,)` of the entry.
         projection: `(Kp,)` of the volume, changed.
-        sigmas: standard deviations of the volume before the change and after it.
-        squares: `|x|^2` of the whitened volume before the change and after it.
-        operator: scale, offset and squared norms.
-        pooled: `(F,)` of the volume's quadrant, changed.
+        gains: of the volume before the change and after it, see `gain`.
+        lengths: `|x|^2` of the whitened volume before the change and after it.
+        offset: `(Kp,)` of the operator.
+        norms: `(Kp,)` squared length of each filter.
+        n_filters: of the operator.
+        unit: of the fixed point.
+        pooled: `(Kp,)` of the volume's quadrant, changed.
         codes: `(2, Kp)` scratch.
     """
-    n_filters, unit = operator.n_filters, np.float32(operator.unit)
-    before = np.float32(operator.scale * operator.unit / sigmas[0])
-    after = np.float32(operator.scale * operator.unit / sigmas[1])
-    length_before, length_after = np.float32(squares[0]), np.float32(squares[1])
-    offset, norms, old, new = operator.offset, operator.square_norms, codes[0], codes[1]
-    step = np.int32(change)
-    total_before, total_after = np.int64(0), np.int64(0)
+    step, old, new = np.int32(change), codes[0], codes[1]
     for k in range(n_filters):
         q = projection[k]
         moved = np.int32(q + step * np.int32(column[k]))
         projection[k] = moved
-        old[k] = fixed_distance(np.float32(q) * before - offset[k], length_before, norms[k], unit)
-        new[k] = fixed_distance(np.float32(moved) * after - offset[k], length_after, norms[k], unit)
-        total_before += old[k]
-        total_after += new[k]
-    mean_before, mean_after = np.int32(total_before // n_filters), np.int32(total_after // n_filters)
+        old[k] = fixed_distance(np.float32(q) * gains[0] - offset[k], lengths[0], norms[k], unit)
+        new[k] = fixed_distance(np.float32(moved) * gains[1] - offset[k], lengths[1], norms[k], unit)
+    mean_before, mean_after = mean_distance(old, n_filters), mean_distance(new, n_filters)
     for k in range(n_filters):
         pooled[k] += max(mean_after - new[k], 0) - max(mean_before - old[k], 0)

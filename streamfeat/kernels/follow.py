@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.events import Events
-from streamfeat.kernels.code import deviation, move_code, move_triangle, whitened_square
+from streamfeat.kernels.code import deviation, gain, move_code, move_triangle, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant, read_features
 from streamfeat.kernels.ingest import UNCHANGED, count_event
@@ -86,14 +86,35 @@ def move_volume(
     entries, eps = operator.columns.shape[0], operator.eps
     sigma = deviation(moments, entries, eps)
     if operator.kind == TRIANGLE:
-        square = whitened_square(moments, sigma, operator)
+        length = np.float32(whitened_square(moments, sigma, operator))
         change_moments(entry, change, state.values[0], operator, moments)
-        sigmas = sigma, deviation(moments, entries, eps)
-        squares = square, whitened_square(moments, sigmas[1], operator)
-        move_triangle(change, column, projection, sigmas, squares, operator, pooled, state.code[0])
+        after = deviation(moments, entries, eps)
+        move_triangle(
+            change,
+            column,
+            projection,
+            (gain(sigma, operator), gain(after, operator)),
+            (length, np.float32(whitened_square(moments, after, operator))),
+            operator.offset,
+            operator.square_norms,
+            operator.n_filters,
+            np.float32(operator.unit),
+            pooled,
+            state.code[0],
+        )
     else:
         change_moments(entry, change, state.values[0], operator, moments)
-        move_code(change, column, projection, sigma, deviation(moments, entries, eps), operator, pooled)
+        move_code(
+            change,
+            column,
+            projection,
+            gain(sigma, operator),
+            gain(deviation(moments, entries, eps), operator),
+            operator.offset,
+            np.float32(operator.threshold),
+            operator.kind,
+            pooled,
+        )
     state.encoded[0] += 1
 
 

@@ -104,9 +104,21 @@ def count_event(
     return (slot * counts.shape[1] + row) * counts.shape[2] + column
 
 
+@inlined
+def current_slot(state: State) -> tuple[int, np.uint64]:
+    """When the current bin began, and the flat index at which its slot begins; before all time, never."""
+    now = state.clock[CLOCK_NOW]
+    if now == BEFORE_TIME:
+        return -BEFORE_TIME, np.uint64(0)
+    n_bins, height, width = state.counts.shape
+    return int(state.clock[CLOCK_START]), np.uint64(now % n_bins * height * width)
+
+
 @kernel
 def count_events(events: Events, height: int, width: int, operator: Operator, state: State) -> None:
     """Count every event of a batch, and note the entries that changed for the next reading.
+
+    Same as `count_event` on each; the events of the current bin, which are nearly all, go a shorter way.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
@@ -115,11 +127,37 @@ def count_events(events: Events, height: int, width: int, operator: Operator, st
         operator: geometry is read from it.
         state: as for `count_event`; `touched` and `is_touched` are changed too.
     """
-    flags = state.is_touched.reshape(-1)
+    counts, flags = state.counts.reshape(-1), state.is_touched.reshape(-1)
+    touched, tally, limit = state.touched, state.tally, operator.max_count
+    # Exact for 16 bits, and a tenth of the time of a division.
+    reciprocal = np.uint64((1 << 32) // operator.downsample + 1)
+    row_length, bin_us = np.uint64(state.counts.shape[2]), np.uint64(operator.bin_us)
+    start, first = current_slot(state)
+    n_touched, n_saturated = np.uint64(state.clock[CLOCK_TOUCHED]), 0
     for i in range(events.shape[0]):
         event = events[i]
-        place = count_event(event.x, event.y, event.p, event.t, height, width, operator, state)
-        if place != UNCHANGED and flags[place] == 0:
-            flags[place] = 1
-            state.touched[state.clock[CLOCK_TOUCHED]] = place
-            state.clock[CLOCK_TOUCHED] += 1
+        x, y, p, t = event.x, event.y, event.p, event.t
+        sound = x < width and y < height and p >> 1 == 0 and BEFORE_TIME < t < -BEFORE_TIME
+        if sound and np.uint64(t - start) < bin_us:
+            # Unsigned, or every index would be tested for being below zero.
+            row, column = np.uint64(y) * reciprocal >> 32, np.uint64(x) * reciprocal >> 32
+            place = first + row * row_length + column
+            before = counts[place]
+            after = before + 2 * p - 1
+            counts[place] = after
+            changed = min(max(before, -limit), limit) != min(max(after, -limit), limit)
+            tally[TALLY_EVENTS] += 1
+            n_saturated += not changed
+            # Always on the stack, and kept or not: whether a count saturates cannot be predicted.
+            touched[n_touched] = place
+            n_touched += np.uint64(changed & (flags[place] == 0))
+            flags[place] |= changed
+            continue
+        other = count_event(x, y, p, t, height, width, operator, state)
+        start, first = current_slot(state)
+        if other != UNCHANGED and flags[other] == 0:
+            flags[other] = 1
+            touched[n_touched] = other
+            n_touched += np.uint64(1)
+    state.clock[CLOCK_TOUCHED] = n_touched
+    tally[TALLY_SATURATED] += n_saturated

@@ -82,7 +82,8 @@ class State(NamedTuple):
     applied: NDArray[np.int16]
     """`(T, H, W)`: the clipped counts that planes stand for."""
     touched: NDArray[np.int32]
-    """`(T * H * W,)`: flat indices of the entries whose clipped count changed since; a stack."""
+    """`(T * H * W + 1,)`: flat indices of the entries whose clipped count changed since; a stack, with room
+    for one that is written and not kept."""
     is_touched: NDArray[np.uint8]
     """`(T, H, W)`: whether an entry is on that stack."""
     touched_slots: NDArray[np.uint8]
