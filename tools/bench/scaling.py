@@ -1,0 +1,144 @@
+"""How the cost of an event grows: the paper's table of complexity, measured.
+
+Lives here: the part `scaling` and its picture. Not here: peers.
+
+One quantity at a time moves away from the paper's geometry (K = 1700, patch 12, 7 bins, one volume for each
+event). An update of the direct formulation is O(K) whatever the volume's length d is, from scratch it is
+O(K d); the inverse formulation pays for its active atoms.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import streamfeat as sf
+from tools.bench.direct import follower
+from tools.bench.material import Setting, random_encoder
+from tools.bench.timing import Contestant, race
+
+__all__ = ["draw_scaling", "measure_scaling"]
+
+SWEEPS: dict[str, tuple[int, ...]] = {
+    "K": (100, 200, 400, 800, 1700, 3400),
+    "patch": (4, 8, 12, 16, 21),
+    "bins": (2, 4, 7, 10),
+    "stride": (2, 3, 4, 6, 12),
+}
+INVERSE = (100, 200, 400, 800, 1700)
+
+
+def measure_scaling(setting: Setting) -> dict[str, Any]:
+    """Nanoseconds an update against K, patch, bins, and an event against stride."""
+    with threadpool_limits(1):
+        return {name: _sweep(setting, name, values) for name, values in SWEEPS.items()} | {
+            "inverse": _inverse(setting)
+        }
+
+
+def _sweep(setting: Setting, name: str, values: tuple[int, ...]) -> dict[str, Any]:
+    values = values[:2] if setting.quick else values
+    contestants, per_event, products = {}, {}, {}
+    for value in values:
+        k = value if name == "K" else setting.n_filters
+        patch = value if name == "patch" else 12
+        geometry = setting.geometry(
+            stride=value if name == "stride" else patch,
+            patch=patch,
+            n_bins=value if name == "bins" else setting.n_bins,
+        )
+        setting.say(f"{name} {value}")
+        encoder = flat_encoder(geometry, k)
+        burst = setting.material.burst(geometry, 100 if setting.quick else 600)
+        contestants[str(value)], updates, _ = follower(burst, encoder)
+        per_event[str(value)] = round(len(updates.rows) / max(1, updates.changed), 3)
+        if name != "stride":
+            products[f"from scratch {value}"] = _product(encoder)
+    result = race(contestants | products, setting.rounds(15))
+    return {
+        "updates_per_event": per_event,
+        "ns": {name: result.figure(name) for name in contestants},
+        "from_scratch_ns": {
+            name.removeprefix("from scratch "): result.figure(name) for name in products
+        },
+    }
+
+
+def _inverse(setting: Setting) -> dict[str, Any]:
+    """Both formulations with the same atoms, volumes of the recording drawn at random."""
+    geometry = setting.geometry(stride=12)
+    contestants = {}
+    for k in INVERSE[: 2 if setting.quick else None]:
+        setting.say(f"inverse, K {k}")
+        burst = setting.material.burst(geometry, 10 if setting.quick else 40)
+        for formulation, parameters in (("direct", {}), ("inverse", {"gap": 1e-4})):
+            encoder = random_encoder(setting.material, geometry, k, formulation, **parameters)
+            contestants[f"{formulation} {k}"], _, _ = follower(burst, encoder)
+    result = race(contestants, setting.rounds(5))
+    return {
+        formulation: {
+            name.partition(" ")[2]: result.figure(name) for name in contestants if name.startswith(formulation)
+        }
+        for formulation in ("direct", "inverse")
+    }
+
+
+def flat_encoder(geometry: sf.Geometry, n_filters: int) -> sf.Encoder:
+    """Random filters without whitening: the direct formulation costs the same whatever they are."""
+    d = geometry.entries
+    filters = np.random.default_rng(0).normal(size=(n_filters, d)) / np.sqrt(d)
+    return sf.Encoder.build(
+        geometry,
+        formulation="direct",
+        encoding="soft",
+        threshold=0.5,
+        filters=filters,
+        whitening=np.eye(d),
+        mean=np.zeros(d),
+    )
+
+
+def _product(encoder: sf.Encoder) -> Contestant:
+    vector, out = np.ones(encoder.geometry.entries, np.float32), np.empty(encoder.n_filters, np.float32)
+    return Contestant(lambda: np.dot(encoder.filters, vector, out=out))
+
+
+def draw_scaling(figures: dict[str, Any], target: Path) -> None:
+    """Four small panels as SVG: microseconds an update, or an event, against each quantity."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    matplotlib.rcParams["svg.hashsalt"] = "streamfeat"  # the same figures give the same file
+    figure = Figure(figsize=(10, 2.8), layout="constrained")
+    panels = figure.subplots(1, 4)
+    series = {
+        "K": {
+            "direct": figures["K"]["ns"],
+            "inverse": figures["inverse"]["inverse"],
+            "from scratch": figures["K"]["from_scratch_ns"],
+        }
+    } | {
+        name: {"direct": figures[name]["ns"], "from scratch": figures[name]["from_scratch_ns"]}
+        for name in ("patch", "bins", "stride")
+    }
+    colours = {"direct": "tab:blue", "inverse": "tab:orange", "from scratch": "tab:grey"}
+    for axes, (name, lines) in zip(panels, series.items(), strict=True):
+        for label, points in lines.items():
+            if not points:
+                continue
+            x = [int(value) for value in points]
+            factor = [figures[name]["updates_per_event"][v] if name == "stride" else 1.0 for v in points]
+            middle, low, high = (
+                [point[p] * f / 1e3 for point, f in zip(points.values(), factor, strict=True)]
+                for p in ("p50", "p10", "p90")
+            )
+            axes.plot(x, middle, marker="o", markersize=3, label=label, color=colours[label])
+            axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=colours[label])
+        axes.set_yscale("log")
+        axes.set_xlabel({"K": "filters K", "patch": "patch, pixels", "bins": "bins", "stride": "stride, pixels"}[name])
+        axes.set_title("us an event" if name == "stride" else "us an event and volume", fontsize=9)
+        axes.grid(alpha=0.3)
+    panels[0].set_xscale("log")
+    panels[0].legend(fontsize=7)
+    figure.savefig(target, format="svg", metadata={"Date": None})
