@@ -29,7 +29,9 @@ BUILDS = {
 
 def compiler() -> str | None:
     """The C compiler of this machine, or None."""
-    return next((path for name in (os.environ.get("CC"), "cc") if name and (path := shutil.which(name))), None)
+    return next(
+        (path for name in (os.environ.get("CC"), "cc") if name and (path := shutil.which(name))), None
+    )
 
 
 def compile_floor(flags: tuple[str, ...]) -> ctypes.CDLL | None:
@@ -55,7 +57,10 @@ class _State(ctypes.Structure):
         ("eps", ctypes.c_double),
         ("scale", ctypes.c_double),
         ("threshold", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("columns", "offset", "projections", "moments", "codes", "pooled")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("columns", "offset", "projections", "moments", "codes", "pooled")
+        ),
     )
 
 

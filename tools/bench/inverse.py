@@ -32,6 +32,12 @@ PROBLEMS, CALLS = 32, 2
 
 def measure_inverse(setting: Setting) -> dict[str, Any]:
     """Nanoseconds for each lasso of our engine, scikit-learn and SPAMS."""
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the gap that was reached is measured
+        return _measure(setting)
+
+
+def _measure(setting: Setting) -> dict[str, Any]:
     geometry = setting.geometry(stride=4)
     learned = encoder_of(setting, geometry, setting.n_filters, "inverse", "soft")
     encoder = sf.Encoder.build(
@@ -55,7 +61,9 @@ def measure_inverse(setting: Setting) -> dict[str, Any]:
     problems = Problems.of(encoder, _passed_through(whole, forth.rows))
     own, exact = _gaps_of_engine(engine, encoder, whole, forth.rows)
     gaps = {"ours": own, "ours, with filters before quantising": exact}
-    used = int(np.median(np.count_nonzero(engine.codes().reshape(-1, encoder.n_filters)[forth.rows[:, 0]], 1)))
+    used = int(
+        np.median(np.count_nonzero(engine.codes().reshape(-1, encoder.n_filters)[forth.rows[:, 0]], 1))
+    )
     missing = []
     for name, options in {
         "lasso_cd": {"alpha": encoder.threshold},
@@ -73,9 +81,7 @@ def measure_inverse(setting: Setting) -> dict[str, Any]:
     else:
         missing.append("spams-bin")
     setting.say(f"{len(updates.rows)} lassos of ours, {len(problems.x)} for others")
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        result = race(contestants, setting.rounds(5))
+    result = race(contestants, setting.rounds(5))
     others = [name for name in contestants if name != "ours"]
     return {
         "threshold": encoder.threshold,

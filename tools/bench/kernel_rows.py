@@ -24,11 +24,9 @@ def measure_kernels(setting: Setting) -> dict[str, Any]:
     from kernel_table import KERNELS, copied
 
     figures = {}
-    for number, row in enumerate(KERNELS):
-        setting.say(f"{number + 1} of {len(KERNELS)}: {row.name}")
-        originals = [
-            row.make(np.random.default_rng([seed, 7])) for seed in range(1 if setting.quick else 4)
-        ]
+    setting.say(f"{len(KERNELS)} kernels")
+    for row in KERNELS:
+        originals = [row.make(np.random.default_rng([seed, 7])) for seed in range(1 if setting.quick else 4)]
         contestants = {
             name: _repeated(function, originals, copied, repeats)
             for name, function, repeats in (("kernel", row.kernel, 5), ("twin", row.twin, 1))

@@ -14,7 +14,7 @@ __all__ = ["measure_latency"]
 
 
 def measure_latency(setting: Setting) -> dict[str, Any]:
-    """Percentiles of the update after each event, recorded order, stride 4, with and without looking ahead."""
+    """Percentiles of single updates in recorded order, stride 4, with and without looking ahead."""
     if importlib.util.find_spec("streamfeat.latency") is None:
         return {"missing": ["streamfeat.latency"]}
     from streamfeat.latency.measure import LatencyReport

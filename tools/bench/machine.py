@@ -12,7 +12,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-__all__ = ["PEERS", "describe"]
+__all__ = ["PEERS", "compiler_version", "describe", "version"]
 
 PEERS = ("eventcv", "tonic", "river", "pandas", "spams-bin", "matplotlib")
 """Packages of the extra `bench` that parts can do without, one by one."""

@@ -142,7 +142,9 @@ class Updates:
         rows, columns = geometry.grid_shape(resolution)
         side = geometry.patch
         places = np.lib.stride_tricks.sliding_window_view(self.counts, (side, side), axis=(1, 2))
-        grid = places[:, : rows * geometry.stride : geometry.stride, : columns * geometry.stride : geometry.stride]
+        grid = places[
+            :, : rows * geometry.stride : geometry.stride, : columns * geometry.stride : geometry.stride
+        ]
         return np.ascontiguousarray(grid[:, :rows, :columns].transpose(1, 2, 0, 3, 4)).reshape(
             rows * columns, -1
         )

@@ -20,8 +20,6 @@ from tools.bench.material import Setting, Updates, random_encoder
 
 __all__ = ["measure_memory", "measure_precision"]
 
-_ROOT = Path(__file__).parents[2]
-
 
 def measure_precision(setting: Setting) -> dict[str, Any]:
     """Soft codes of the engine against the same in float64 NumPy, with unquantised filters."""
@@ -58,12 +56,19 @@ def measure_memory(setting: Setting) -> dict[str, Any]:
     """An engine for 640x480 pixels, in processes of its own, without and with looking ahead."""
     figures = {}
     for look_ahead in (False, True):
-        command = [sys.executable, "-m", "tools.bench.precision", str(setting.n_filters), str(int(look_ahead))]
+        command = [
+            sys.executable,
+            "-m",
+            "tools.bench.precision",
+            str(setting.n_filters),
+            str(int(look_ahead)),
+        ]
         # Whatever is allocated is a mapping of its own, so that what was freed before does not hide it.
-        environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}
-        done = subprocess.run(
-            command, cwd=_ROOT, env=environment, capture_output=True, text=True, check=True
-        )
+        environment = os.environ | {
+            "MALLOC_MMAP_THRESHOLD_": "65536",
+            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        }
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         figures["looking ahead" if look_ahead else "one plane"] = json.loads(done.stdout)
     return figures
 
@@ -140,6 +145,7 @@ def _allocations(engine: sf.Engine, rng: np.random.Generator) -> int:
     for i, n in enumerate((1000, 2000)):
         start = 10_000 + 2000 * i
         followed, fed = (_events(engine, rng, n, t, t + 900) for t in (start, start + 1000))
+        engine.features()
         before = rtsys.get_allocation_stats().mi_alloc
         engine.follow(followed)
         engine.feed(fed)

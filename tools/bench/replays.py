@@ -10,8 +10,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import streamfeat as sf
 from mcap.reader import NonSeekingReader
+
+import streamfeat as sf
 from streamfeat.replay import Replay
 from tools.bench.material import Setting, encoder_of
 from tools.bench.timing import Contestant, race
@@ -86,7 +87,5 @@ def _measure(setting: Setting, path: Path, model: Path, events: int) -> dict[str
         "emissions": emissions,
         "race": result.figures(),
         "events_per_s": {name: round(1e9 / result.figure(name)["p50"]) for name in contestants},
-        "speed_of_reading": {
-            name: result.ratio(name, "replay") for name in contestants if name != "replay"
-        },
+        "speed_of_reading": {name: result.ratio(name, "replay") for name in contestants if name != "replay"},
     }

@@ -39,6 +39,7 @@ def measure_scaling(setting: Setting) -> dict[str, Any]:
 
 def _sweep(setting: Setting, name: str, values: tuple[int, ...]) -> dict[str, Any]:
     values = values[:2] if setting.quick else values
+    setting.say(f"{name}: {', '.join(map(str, values))}")
     contestants, per_event, products = {}, {}, {}
     for value in values:
         k = value if name == "K" else setting.n_filters
@@ -48,7 +49,6 @@ def _sweep(setting: Setting, name: str, values: tuple[int, ...]) -> dict[str, An
             patch=patch,
             n_bins=value if name == "bins" else setting.n_bins,
         )
-        setting.say(f"{name} {value}")
         encoder = flat_encoder(geometry, k)
         burst = setting.material.burst(geometry, 100 if setting.quick else 600)
         contestants[str(value)], updates, _ = follower(burst, encoder)
@@ -59,18 +59,16 @@ def _sweep(setting: Setting, name: str, values: tuple[int, ...]) -> dict[str, An
     return {
         "updates_per_event": per_event,
         "ns": {name: result.figure(name) for name in contestants},
-        "from_scratch_ns": {
-            name.removeprefix("from scratch "): result.figure(name) for name in products
-        },
+        "from_scratch_ns": {name.removeprefix("from scratch "): result.figure(name) for name in products},
     }
 
 
 def _inverse(setting: Setting) -> dict[str, Any]:
     """Both formulations with the same atoms, volumes of the recording drawn at random."""
+    setting.say("both formulations")
     geometry = setting.geometry(stride=12)
     contestants = {}
     for k in INVERSE[: 2 if setting.quick else None]:
-        setting.say(f"inverse, K {k}")
         burst = setting.material.burst(geometry, 10 if setting.quick else 40)
         for formulation, parameters in (("direct", {}), ("inverse", {"gap": 1e-4})):
             encoder = random_encoder(setting.material, geometry, k, formulation, **parameters)
@@ -78,7 +76,9 @@ def _inverse(setting: Setting) -> dict[str, Any]:
     result = race(contestants, setting.rounds(5))
     return {
         formulation: {
-            name.partition(" ")[2]: result.figure(name) for name in contestants if name.startswith(formulation)
+            name.partition(" ")[2]: result.figure(name)
+            for name in contestants
+            if name.startswith(formulation)
         }
         for formulation in ("direct", "inverse")
     }
@@ -136,7 +136,9 @@ def draw_scaling(figures: dict[str, Any], target: Path) -> None:
             axes.plot(x, middle, marker="o", markersize=3, label=label, color=colours[label])
             axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=colours[label])
         axes.set_yscale("log")
-        axes.set_xlabel({"K": "filters K", "patch": "patch, pixels", "bins": "bins", "stride": "stride, pixels"}[name])
+        axes.set_xlabel(
+            {"K": "filters K", "patch": "patch, pixels", "bins": "bins", "stride": "stride, pixels"}[name]
+        )
         axes.set_title("us an event" if name == "stride" else "us an event and volume", fontsize=9)
         axes.grid(alpha=0.3)
     panels[0].set_xscale("log")

@@ -1,0 +1,253 @@
+"""Results as the tables of the README.
+
+Lives here: Markdown from the JSON of a run, and the place in the README where it goes.
+Not here: measuring; verdicts (`targets`).
+"""
+
+from pathlib import Path
+from typing import Any
+
+from tools.bench.targets import Verdict, judge
+
+__all__ = ["BEGIN", "END", "insert", "markdown", "verdict_lines"]
+
+BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
+
+
+def insert(readme: str, results: dict[str, Any]) -> str:
+    """The README with the part between the markers made anew.
+
+    Raises:
+        ValueError: the markers are not there.
+    """
+    before, begin, rest = readme.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(f"the README has no {BEGIN} ... {END}")
+    return f"{before}{BEGIN}\n{markdown(results)}\n{END}{after}"
+
+
+def read_between(readme: Path) -> str:
+    """What stands between the markers."""
+    return readme.read_text(encoding="utf-8").partition(BEGIN)[2].partition(END)[0].strip("\n")
+
+
+def markdown(results: dict[str, Any]) -> str:
+    """Everything that the README shows of a run."""
+    parts = results["parts"]
+    blocks = [_machine(results), _targets(results)]
+    blocks += [table(parts[name]) for name, table in _TABLES.items() if name in parts]
+    if "scaling" in parts:
+        blocks.append(
+            "![Latency against K, patch, bins and stride](tools/bench/scaling.svg)\n\n"
+            "The paper's table of complexity, measured: an update of the direct formulation costs O(K), "
+            "whatever the patch and the bins; from scratch O(K d); the inverse formulation pays for its "
+            "active atoms."
+        )
+    return "\n\n".join(blocks)
+
+
+def verdict_lines(results: dict[str, Any]) -> list[str]:
+    """One line a target, for the terminal."""
+    return [
+        f"{_verdict(v):>9}  {v.target.figure.replace('`', '')}: {_value(v)}, target {v.target.text}"
+        for v in judge(results)
+    ]
+
+
+def _machine(results: dict[str, Any]) -> str:
+    machine, setting = results["machine"], results["setting"]
+    caches = ", ".join(f"{name} {size}" for name, size in machine["caches"].items())
+    return (
+        f"Measured on {machine['cores']} cores of {machine['processor']}"
+        f"{' (a shared virtual machine)' if machine['hypervisor'] else ''}, {caches}, with "
+        f"`{setting['recording']}` at K = {setting['n_filters']}, patch 12, {setting['n_bins']} bins. "
+        "Contestants run in turns in one process; medians (10th to 90th percentile) of times, or of ratios "
+        "inside a round; compilation and warm-up are not counted. `python tools/bench --help` measures it on your machine, "
+        "[`tools/bench/results.json`](tools/bench/results.json) has every figure."
+    )
+
+
+def _targets(results: dict[str, Any]) -> str:
+    rows = [(v.target.figure, v.target.text, _value(v), _verdict(v)) for v in judge(results)]
+    return _table(("figure", "target", "measured", ""), rows)
+
+
+def _verdict(verdict: Verdict) -> str:
+    return {True: "met", False: "not met", None: "no figure"}[verdict.met]
+
+
+def _value(verdict: Verdict) -> str:
+    if verdict.value is None:
+        return "not measured"
+    return _spread(verdict.found) if isinstance(verdict.found, dict) else f"{verdict.value:.3g}"
+
+
+def _floors(part: dict[str, Any]) -> str:
+    ns = part["race"]["ns"]
+    rows = [("streamfeat", _time(ns["ours"]), "1")]
+    if part["floor"]:
+        rows.append(
+            (f"the same update in {part['floor']}", _time(ns[part["floor"]]), _over(part["ours_over_floor"]))
+        )
+    if part["bytes"]:
+        size = f"{part['bytes']['bytes'] / 1e3:.0f} kB"
+        rows.append(
+            (f"the bytes alone: {size}", _time(part["bytes"]["ns"]), _over(part["bytes"]["ours_over_bytes"]))
+        )
+    return (
+        "**Floors**: one event and volume, `soft`. The C is compiled with `-O3 -march=native`, its features "
+        f"{_same_features(part['floor_equals_ours'])}; the bytes are one column read, the projection and the "
+        "pooled sums read and written, the offsets read, each array walked over alone in the order of the "
+        "same events.\n\n"
+        + _table(
+            ("", "time", "streamfeat takes"), [(a, b, c if c == "1" else f"{c} x that") for a, b, c in rows]
+        )
+    )
+
+
+def _same_features(equal: bool | None) -> str:
+    return {True: "are those of the engine, bit for bit", False: "DIFFER", None: "were not compared"}[equal]
+
+
+def _peers(part: dict[str, Any]) -> str:
+    rows = [
+        (
+            name.replace("ours", "streamfeat"),
+            _time(figure),
+            _over(part["over_ours"][name]) + " x" if name in part["over_ours"] else "",
+        )
+        for name, figure in part["race"]["ns"].items()
+    ]
+    return (
+        "**Direct formulation**: one event and volume.\n\n"
+        + _table(("", "time", "slower than `soft`"), rows)
+        + _missing(part)
+    )
+
+
+def _inverse(part: dict[str, Any]) -> str:
+    rows = [
+        (
+            name.replace("ours", "streamfeat"),
+            _time(figure),
+            _over(part["over_ours"][name]) + " x" if name in part["over_ours"] else "",
+            f"{part['largest_relative_gap'][name]:.1g}" if name in part["largest_relative_gap"] else "",
+        )
+        for name, figure in part["race"]["ns"].items()
+    ]
+    return (
+        f"**Inverse formulation**: one event and volume, about {part['nonzero']} active atoms.\n\n"
+        + _table(("", "time", "slower", "largest relative gap"), rows)
+        + _missing(part)
+    )
+
+
+def _ingest(part: dict[str, Any]) -> str:
+    rows = [
+        (name.replace("ours", "`Engine.feed`"), f"{rate:g}")
+        for name, rate in part["million_events_per_s"].items()
+    ]
+    return "**Ingest alone**: million events a second.\n\n" + _table(("", "Mev/s"), rows) + _missing(part)
+
+
+def _learning(part: dict[str, Any]) -> str:
+    rows = [
+        (name.replace("ours", "streamfeat"), _time(figure)) for name, figure in part["race"]["ns"].items()
+    ]
+    return (
+        f"**One online learning step**: a sample of {part['features']:,} features.\n\n"
+        + _table(("", "time a sample"), rows)
+        + _missing(part)
+    )
+
+
+def _replay(part: dict[str, Any]) -> str:
+    rows = [
+        (
+            name,
+            *(f"{figures['events_per_s'][kind]:,}" for kind in figures["events_per_s"]),
+            f"{figures['emissions']:,}",
+        )
+        for name, figures in part.items()
+    ]
+    return "**Replay**: events a second, lz4, `--emit 10ms`, K = 400, stride 4.\n\n" + _table(
+        ("recording", "replay", "reading messages", "reading and decoding", "emissions"), rows
+    )
+
+
+def _latency(part: dict[str, Any]) -> str:
+    if "missing" in part:
+        return ""
+    rows = []
+    for mode, figures in part.items():
+        update = figures["update"]
+        tails = [f"{update[f'{p}_ns'] / 1e3:.1f}" for p in ("p50", "p90", "p99", "p99.9")]
+        rows.append(
+            (mode, *tails, f"{update['max_ns'] / 1e3:.0f}", f"{100 * update['boundary_share']:.2f} %")
+        )
+    return "**Latency of single events**, stride 4, microseconds (`streamfeat latency`).\n\n" + _table(
+        ("bin boundaries", "p50", "p90", "p99", "p99.9", "max", "events at a boundary"), rows
+    )
+
+
+def _memory(part: dict[str, Any]) -> str:
+    rows = [
+        (
+            mode,
+            f"{f['least_bytes'] / 1e6:.1f}",
+            f"{f['state_bytes'] / 1e6:.1f}",
+            f"{f['resident_bytes'] / 1e6:.1f}",
+        )
+        for mode, f in part.items()
+    ]
+    operator = next(iter(part.values()))["operator_bytes"] / 1e6
+    return (
+        "**Memory** of an engine for 640x480, downsample 4, stride 4, in MB. The minimum: `4 T H W` for "
+        "counts, `4 V K` for projections, `16 K` for pooled sums. The operator, "
+        f"{operator:.1f} MB, is shared and read-only.\n\n"
+        + _table(("", "minimum", "state", "resident"), rows)
+    )
+
+
+def _missing(part: dict[str, Any]) -> str:
+    return f"\n\nNot measured: `pip install {' '.join(part['missing'])}`." if part.get("missing") else ""
+
+
+_TABLES = {
+    "floors": _floors,
+    "peers": _peers,
+    "inverse": _inverse,
+    "ingest": _ingest,
+    "latency": _latency,
+    "replay": _replay,
+    "learning": _learning,
+    "memory": _memory,
+}
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, tuple("---" if i == 0 else "---:" for i in range(len(head))), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _time(figure: dict[str, float]) -> str:
+    """A time in nanoseconds, microseconds or milliseconds, with its spread."""
+    unit, size = next(
+        (u, s) for u, s in (("ms", 1e6), ("us", 1e3), ("ns", 1.0)) if figure["p50"] >= s or s == 1.0
+    )
+    p50, p10, p90 = (_short(figure[name] / size) for name in ("p50", "p10", "p90"))
+    return f"{p50} {unit} ({p10} to {p90})"
+
+
+def _over(figure: dict[str, float]) -> str:
+    return _short(figure["p50"])
+
+
+def _spread(figure: dict[str, float]) -> str:
+    return f"{_short(figure['p50'])} ({_short(figure['p10'])} to {_short(figure['p90'])})"
+
+
+def _short(value: float) -> str:
+    """Three digits that count."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
