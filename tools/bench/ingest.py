@@ -13,7 +13,7 @@ import numpy as np
 
 import streamfeat as sf
 from tools.bench.material import Setting, random_encoder
-from tools.bench.timing import Contestant, race
+from tools.bench.timing import PROCESS, Contestant, race
 
 __all__ = ["measure_ingest"]
 
@@ -69,4 +69,4 @@ def _eventcv(events: Any, origin: int, size: tuple[int, int], n_bins: int) -> Co
 
     table = np.stack([events["x"], events["y"], events["t"] - origin, events["p"]], axis=1)
     stream = eventcv.from_numpy(table.astype(np.int64), sensor_size=size, time_unit="us")
-    return Contestant(lambda: stream.voxel(bins=n_bins), len(events), parallel=True)
+    return Contestant(lambda: stream.voxel(bins=n_bins), len(events), clock=PROCESS)

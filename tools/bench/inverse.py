@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 import streamfeat as sf
 from tools.bench.direct import follower
 from tools.bench.material import Setting, Updates, encoder_of
-from tools.bench.timing import Contestant, race
+from tools.bench.timing import THREAD, WALL, Contestant, race
 
 __all__ = ["measure_inverse"]
 
@@ -185,4 +185,4 @@ class Problems:
             return spams.lasso(x, Q=gram, q=right, lambda1=self.penalty, mode=2, numThreads=threads)
 
         codes = np.asarray(solve().todense()).T
-        return Contestant(solve, len(self.x), parallel=threads > 1), codes
+        return Contestant(solve, len(self.x), clock=WALL if threads > 1 else THREAD), codes

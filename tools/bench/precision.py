@@ -16,7 +16,7 @@ from numba.core.runtime import _nrt_python, rtsys
 import streamfeat as sf
 from streamfeat.window import count_window
 from tools.bench.inverse import whitened
-from tools.bench.material import Setting, Updates, random_encoder
+from tools.bench.material import Setting, Updates, encoder_of
 
 __all__ = ["measure_memory", "measure_precision"]
 
@@ -24,7 +24,7 @@ __all__ = ["measure_memory", "measure_precision"]
 def measure_precision(setting: Setting) -> dict[str, Any]:
     """Soft codes of the engine against the same in float64 NumPy, with unquantised filters."""
     geometry = setting.geometry(stride=4)
-    encoder = random_encoder(setting.material, geometry, setting.n_filters)
+    encoder = encoder_of(setting, geometry, setting.n_filters, "direct", "soft")
     filters, threshold = encoder.filters.astype(np.float64), encoder.threshold
     largest = difference = 0.0
     volumes = 0

@@ -15,7 +15,7 @@ from mcap.reader import NonSeekingReader
 import streamfeat as sf
 from streamfeat.replay import Replay
 from tools.bench.material import Setting, encoder_of
-from tools.bench.timing import Contestant, race
+from tools.bench.timing import WALL, Contestant, race
 
 __all__ = ["measure_replay"]
 
@@ -23,7 +23,7 @@ __all__ = ["measure_replay"]
 def measure_replay(setting: Setting, dense: Path | None) -> dict[str, Any]:
     """Events a second of `replay --emit 10ms` with K = 400 and stride 4, and of reading."""
     geometry = sf.Geometry(patch=12, stride=4, n_bins=3, bin_us=setting.material.bin_us(3))
-    encoder = encoder_of(setting, geometry, 400, "direct", "split")
+    encoder = encoder_of(setting, geometry, 40 if setting.quick else 400, "direct", "split")
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model.safetensors"
@@ -77,9 +77,9 @@ def _measure(setting: Setting, path: Path, model: Path, events: int) -> dict[str
                 pass
 
     contestants = {
-        "replay": Contestant(replay, events, parallel=True),
-        "messages, not decoded": Contestant(read_messages, events, parallel=True),
-        "messages, decoded": Contestant(read_events, events, parallel=True),
+        "replay": Contestant(replay, events, clock=WALL),
+        "messages, not decoded": Contestant(read_messages, events, clock=WALL),
+        "messages, decoded": Contestant(read_events, events, clock=WALL),
     }
     result = race(contestants, setting.rounds(5))
     return {

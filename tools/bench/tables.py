@@ -63,8 +63,8 @@ def _machine(results: dict[str, Any]) -> str:
         f"{' (a shared virtual machine)' if machine['hypervisor'] else ''}, {caches}, with "
         f"`{setting['recording']}` at K = {setting['n_filters']}, patch 12, {setting['n_bins']} bins. "
         "Contestants run in turns in one process; medians (10th to 90th percentile) of times, or of ratios "
-        "inside a round; compilation and warm-up are not counted. `python tools/bench --help` measures it on your machine, "
-        "[`tools/bench/results.json`](tools/bench/results.json) has every figure."
+        "inside a round; compilation and warm-up are not counted. `python tools/bench` measures it on "
+        "your machine; [`tools/bench/results.json`](tools/bench/results.json) has every figure."
     )
 
 

@@ -17,10 +17,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STOLEN_LIMIT", "Contestant", "Race", "race", "stolen_seconds", "summary"]
+__all__ = [
+    "PROCESS",
+    "STOLEN_LIMIT",
+    "THREAD",
+    "WALL",
+    "Clock",
+    "Contestant",
+    "Race",
+    "race",
+    "stolen_seconds",
+    "summary",
+]
 
 STOLEN_LIMIT = 0.1
 """A round in which the host took more than this share of a processor is thrown away."""
+
+Clock = Callable[[], int]
+
+THREAD: Clock = time.thread_time_ns
+PROCESS: Clock = time.process_time_ns
+WALL: Clock = time.perf_counter_ns
 
 _TICK = 0.01  # seconds, USER_HZ
 
@@ -30,13 +47,14 @@ class Contestant:
     """Something to time: `units` things are done by a `run`; `after` is not timed.
 
     What runs in one thread is timed by that thread's processor time, which does not count moments in which
-    other programs had the core; what runs in several (`parallel`) by the clock on the wall.
+    other programs had the core. What runs in several takes the time on the wall, and a peer that may do so
+    the processor time of the whole process.
     """
 
     run: Callable[[], object]
     units: float = 1.0
     after: Callable[[], object] | None = None
-    parallel: bool = False
+    clock: Clock = THREAD
 
 
 @dataclass(frozen=True)
@@ -107,10 +125,9 @@ def race(contestants: dict[str, Contestant], rounds: int) -> Race:
 
 
 def _time(contestant: Contestant) -> float:
-    clock = time.perf_counter_ns if contestant.parallel else time.thread_time_ns
-    start = clock()
+    start = contestant.clock()
     contestant.run()
-    taken = clock() - start
+    taken = contestant.clock() - start
     if contestant.after:
         contestant.after()
     return taken / contestant.units
