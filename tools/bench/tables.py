@@ -44,7 +44,7 @@ def markdown(results: dict[str, Any]) -> str:
             "whatever the patch and the bins; from scratch O(K d); the inverse formulation pays for its "
             "active atoms."
         )
-    return "\n\n".join(blocks)
+    return "\n\n".join(block for block in blocks if block)
 
 
 def verdict_lines(results: dict[str, Any]) -> list[str]:
@@ -181,13 +181,14 @@ def _latency(part: dict[str, Any]) -> str:
         return ""
     rows = []
     for mode, figures in part.items():
-        update = figures["update"]
-        tails = [f"{update[f'{p}_ns'] / 1e3:.1f}" for p in ("p50", "p90", "p99", "p99.9")]
-        rows.append(
-            (mode, *tails, f"{update['max_ns'] / 1e3:.0f}", f"{100 * update['boundary_share']:.2f} %")
-        )
-    return "**Latency of single events**, stride 4, microseconds (`streamfeat latency`).\n\n" + _table(
-        ("bin boundaries", "p50", "p90", "p99", "p99.9", "max", "events at a boundary"), rows
+        for kind, what in (("update", "each event's median"), ("as they came", "all runs as they came")):
+            tails = [_microseconds(figures[kind][f"{p}_ns"]) for p in ("p50", "p90", "p99", "p99.9", "max")]
+            rows.append((f"{mode}, {what}", *tails))
+    share = 100 * part["looking ahead"]["update"]["boundary_share"]
+    return (
+        "**Latency of single events**, stride 4, in microseconds, the same stream several times; "
+        f"{share:.2f} % of the events begin a bin.\n\n"
+        + _table(("", "p50", "p90", "p99", "p99.9", "max"), rows)
     )
 
 
@@ -238,6 +239,10 @@ def _time(figure: dict[str, float]) -> str:
     )
     p50, p10, p90 = (_short(figure[name] / size) for name in ("p50", "p10", "p90"))
     return f"{p50} {unit} ({p10} to {p90})"
+
+
+def _microseconds(ns: float | None) -> str:
+    return "" if ns is None else _short(ns / 1e3)
 
 
 def _over(figure: dict[str, float]) -> str:
