@@ -1,5 +1,6 @@
 """The bench: its own arithmetic, every part at its smallest, and the README against the results."""
 
+import importlib.util
 import json
 import sys
 import time
@@ -17,6 +18,8 @@ sys.path.append(str(ROOT))
 
 from tools.bench import __main__ as program  # noqa: E402
 from tools.bench import floor, material, tables, targets, timing  # noqa: E402
+from tools.bench.direct import measure_floors  # noqa: E402
+from tools.bench.ingest import measure_ingest  # noqa: E402
 from tools.bench.inverse import Problems  # noqa: E402
 
 RECORDING = ROOT / "recordings" / "digits_train.mcap"
@@ -125,6 +128,24 @@ def test_a_target_is_met_missed_or_has_no_figure():
     assert by_figure["floors", 2] is None
     assert by_figure["precision", 1e-4] is False
     assert by_figure["ingest", 15] is None
+
+
+def test_what_is_missing_is_named_and_the_rest_is_measured(digits, tmp_path, monkeypatch):
+    find_spec = importlib.util.find_spec
+    without = {"tonic", "eventcv"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in without else find_spec(name)
+    )
+    monkeypatch.setattr(floor, "compiler", lambda: None)
+    setting = material.Setting(digits, True, 20, 3, tmp_path, lambda text: None)
+    parts = {"ingest": measure_ingest(setting), "floors": measure_floors(setting)}
+    assert parts["ingest"]["missing"] == ["tonic", "eventcv"]
+    assert parts["ingest"]["race"]["ns"]["ours"]["p50"] > 0
+    assert parts["floors"]["floor"] is None
+    assert {v.met for v in targets.judge({"parts": parts})} == {None}
+    shown = [tables.TABLES[name](part) for name, part in parts.items()]
+    assert "pip install tonic eventcv" in shown[0]
+    assert "the same update" not in shown[1]
 
 
 @pytest.fixture(scope="module")

@@ -124,9 +124,13 @@ def _measure(options: argparse.Namespace) -> int:
         results["parts"][name] = PARTS[name][0](setting, *more)
         seconds = time.perf_counter() - start
         share = (stolen_seconds() - stolen) / seconds
-        results["runs"][name] = {"seconds": round(seconds, 1), "stolen_share": round(share, 3)}
+        results["runs"][name] = {
+            "recording": events.name,
+            "seconds": round(seconds, 1),
+            "stolen_share": round(share, 3),
+        }
+        options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         _say(f"{seconds:.0f} s, the host took {100 * share:.0f} % of a processor")
-    options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     if "scaling" in wanted and "matplotlib" not in missing:
         draw_scaling(results["parts"]["scaling"], options.json.with_name("scaling.svg"))
     print("\n".join(tables.verdict_lines(results)))

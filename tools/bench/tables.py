@@ -9,7 +9,7 @@ from typing import Any
 
 from tools.bench.targets import Verdict, judge
 
-__all__ = ["BEGIN", "END", "insert", "markdown", "verdict_lines"]
+__all__ = ["BEGIN", "END", "TABLES", "insert", "markdown", "read_between", "verdict_lines"]
 
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
@@ -36,7 +36,7 @@ def markdown(results: dict[str, Any]) -> str:
     """Everything that the README shows of a run."""
     parts = results["parts"]
     blocks = [_machine(results), _targets(results)]
-    blocks += [table(parts[name]) for name, table in _TABLES.items() if name in parts]
+    blocks += [table(parts[name]) for name, table in TABLES.items() if name in parts]
     if "scaling" in parts:
         blocks.append(
             "![Latency against K, patch, bins and stride](tools/bench/scaling.svg)\n\n"
@@ -215,7 +215,7 @@ def _missing(part: dict[str, Any]) -> str:
     return f"\n\nNot measured: `pip install {' '.join(part['missing'])}`." if part.get("missing") else ""
 
 
-_TABLES = {
+TABLES = {
     "floors": _floors,
     "peers": _peers,
     "inverse": _inverse,
