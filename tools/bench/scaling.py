@@ -109,7 +109,8 @@ def draw_scaling(figures: dict[str, Any], target: Path) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    matplotlib.rcParams["svg.hashsalt"] = "streamfeat"  # the same figures give the same file
+    # Text stays text, and the same figures give the same file.
+    matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "streamfeat"})
     figure = Figure(figsize=(10, 2.8), layout="constrained")
     panels = figure.subplots(1, 4)
     series = {
