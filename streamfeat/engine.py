@@ -27,6 +27,7 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CLOCK_SLOT,
     CLOCK_START,
     CLOCK_TOUCHED,
     CURSOR_CODED,
@@ -79,7 +80,7 @@ class Snapshot:
         fingerprint: of the encoder.
         counts: `(T, H, W)` int32, the ring.
         atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        clock: `(6,)` int64, of which the current bin and the origin matter.
+        clock: `(7,)` int64, of which the current bin and the origin matter.
         tally: `(5,)` int64, what was counted.
         encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
     """
@@ -142,7 +143,7 @@ class Engine:
             InputError: not an array of EVENT_DTYPE.
         """
         events = self._checked(batch)
-        count_events(events, *self.resolution, self._operator, self._state)
+        count_events(events, self._operator, self._state)
 
     def follow(self, batch: Events) -> None:
         """Feed a batch event by event, with features brought up to date after each.
@@ -157,7 +158,7 @@ class Engine:
         """
         events = self._checked(batch)
         self._update()
-        follow(events, *self.resolution, self.grid_shape, self._operator, self._state)
+        follow(events, self.grid_shape, self._operator, self._state)
 
     def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Feed a batch event by event, and read the features after each.
@@ -176,7 +177,7 @@ class Engine:
         self._update()
         features = np.empty((len(events), n_features(self._operator)), np.float32)
         accepted = np.empty(len(events), np.int64)
-        trace(events, *self.resolution, self.grid_shape, self._operator, self._state, features, accepted)
+        trace(events, self.grid_shape, self._operator, self._state, features, accepted)
         return features, accepted
 
     def prepare(self, columns: int) -> bool:
@@ -332,7 +333,8 @@ class Engine:
         state.counts[:] = snapshot.counts
         state.applied[:] = snapshot.counts.clip(-limit, limit)
         codes[:] = snapshot.atoms
-        state.clock[[CLOCK_NOW, CLOCK_START]] = snapshot.clock[[CLOCK_NOW, CLOCK_START]]
+        moment = [CLOCK_NOW, CLOCK_START, CLOCK_SLOT]
+        state.clock[moment] = snapshot.clock[moment]
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
         update(self.grid_shape, self._operator, state)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0

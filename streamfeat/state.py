@@ -5,6 +5,7 @@ Not here: what an event does to them.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.events import Resolution
 from streamfeat.geometry import Geometry
@@ -49,7 +50,7 @@ def allocate_state(
     volumes = rows * columns if keep else 1
     padded = operator.offset.shape[0]
     atoms = operator.n_filters if operator.inverse else 0
-    clock = np.zeros(6, np.int64)
+    clock = np.zeros(7, np.int64)
     clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
     clock[CLOCK_ORIGIN] = origin_us
     features = 2 * padded if operator.kind == SPLIT else padded
@@ -59,6 +60,10 @@ def allocate_state(
         touched=np.zeros(int(np.prod(ring)) + 1, np.int32),
         is_touched=np.zeros(ring, np.uint8),
         touched_slots=np.zeros(geometry.n_bins, np.uint8),
+        ring_rows=(np.arange(resolution[0]) // geometry.downsample).astype(np.int32),
+        ring_columns=(np.arange(resolution[1]) // geometry.downsample).astype(np.int32),
+        volume_rows=_covering(geometry, ring[1], rows),
+        volume_columns=_covering(geometry, ring[2], columns),
         clock=clock,
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
@@ -77,3 +82,10 @@ def allocate_state(
         changes=np.zeros((PARTS, geometry.entries), np.int16),
         corners=np.zeros((PARTS, atoms * padded), np.float32),
     )
+
+
+def _covering(geometry: Geometry, pixels: int, volumes: int) -> NDArray[np.int32]:
+    """First and last plus one of the volumes along an axis that cover each of `n` pixels: `(n, 2)`."""
+    starts, pixel = np.arange(volumes) * geometry.stride, np.arange(pixels)
+    first = np.searchsorted(starts, pixel - geometry.patch, side="right")
+    return np.stack([first, np.searchsorted(starts, pixel, side="right")], axis=1).astype(np.int32)

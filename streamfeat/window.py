@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.encode import read_features
-from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, PARTS, Operator
+from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_SLOT, PARTS, Operator
 from streamfeat.kernels.planes import complete
 from streamfeat.operator import n_features, with_fixed_point
 from streamfeat.state import allocate_state
@@ -70,7 +70,7 @@ def encode_window(
     pooling = with_fixed_point(operator, shape)
     state = allocate_state(geometry, pooling, resolution, keep=False)
     state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
-    state.clock[CLOCK_NOW] = -1  # the window ends with the last slot
+    state.clock[CLOCK_SLOT] = geometry.n_bins - 1  # the window ends with the last slot
     for part in range(PARTS):
         complete(part, shape, pooling, state)
     features = np.empty(n_features(pooling), np.float32)

@@ -10,6 +10,7 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CLOCK_SLOT,
     CLOCK_START,
     CLOCK_TOUCHED,
     CURSOR_CODED,
@@ -98,8 +99,9 @@ def _write(events, out):
 
 
 def deviation(moments, entries, eps):
-    mean = int(moments[MOMENT_SUM]) / entries
-    return math.sqrt(int(moments[MOMENT_SQUARES]) / entries - mean * mean + eps)
+    share = 1 / entries
+    mean = int(moments[MOMENT_SUM]) * share
+    return math.sqrt(int(moments[MOMENT_SQUARES]) * share - mean * mean + eps)
 
 
 def whitened_square(moments, sigma, operator):
@@ -184,6 +186,7 @@ def advance_to_bin(new, operator, state):
     if now != BEFORE_TIME:
         state.tally[TALLY_ROLLS] += new - now
     clock[CLOCK_NOW] = new
+    clock[CLOCK_SLOT] = new % n_bins
     clock[CLOCK_START] = int(clock[CLOCK_ORIGIN]) + new * operator.bin_us
     planes = {0, 1} if len(state.cursors) == 2 else {0}
     (clock[CLOCK_PLANE],) = planes - {plane} or {0}
@@ -193,42 +196,46 @@ def advance_to_bin(new, operator, state):
         state.pooled[other] = 0
 
 
-def count_event(x, y, p, t, height, width, operator, state):
+def slot_of(position, state):
+    return (int(state.clock[CLOCK_SLOT]) + 1 + position) % len(state.counts)
+
+
+def count_event(x, y, p, t, operator, state):
     counts, clock, tally = state.counts, state.clock, state.tally
     n_bins, limit = len(counts), operator.max_count
+    height, width = len(state.ring_rows), len(state.ring_columns)
     if not (x < width and y < height and p in (0, 1) and abs(int(t)) < 2**62):
         tally[TALLY_REJECTED] += 1
-        return -1
+        return -1, 0, 0
     bin_index = (int(t) - int(clock[CLOCK_ORIGIN])) // operator.bin_us
     advance_to_bin(bin_index, operator, state)
-    if bin_index not in range(clock[CLOCK_NOW] - n_bins + 1, clock[CLOCK_NOW] + 1):
+    window = range(int(clock[CLOCK_NOW]) - n_bins + 1, int(clock[CLOCK_NOW]) + 1)
+    if bin_index not in window:
         tally[TALLY_LATE] += 1
-        return -1
+        return -1, 0, 0
     tally[TALLY_EVENTS] += 1
-    entry = bin_index % n_bins, y // operator.downsample, x // operator.downsample
+    row, column = y // operator.downsample, x // operator.downsample
+    entry = bin_index % n_bins, row, column
     before = np.clip(counts[entry], -limit, limit)
     counts[entry] += {0: -1, 1: 1}[p]
     if np.clip(counts[entry], -limit, limit) == before:
         tally[TALLY_SATURATED] += 1
-        return -1
-    return int(np.ravel_multi_index(entry, counts.shape))
+        return -1, 0, 0
+    return window.index(bin_index), row, column
 
 
-def current_slot(state):
-    now = int(state.clock[CLOCK_NOW])
-    if now == BEFORE_TIME:
-        return 2**62, 0
-    n_bins, *slot = state.counts.shape
-    return int(state.clock[CLOCK_START]), now % n_bins * math.prod(slot)
+def start_of_bin(state):
+    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] != BEFORE_TIME else 2**62
 
 
-def count_events(events, height, width, operator, state):
-    on_stack, clock = state.is_touched.reshape(-1), state.clock
+def count_events(events, operator, state):
+    on_stack, clock = state.is_touched, state.clock
     for event in events.tolist():
-        place = count_event(*event, height, width, operator, state)
-        if place >= 0 and not on_stack[place]:
-            on_stack[place] = 1
-            state.touched[clock[CLOCK_TOUCHED]] = place
+        position, row, column = count_event(*event, operator, state)
+        entry = slot_of(position, state), row, column
+        if position >= 0 and not on_stack[entry]:
+            on_stack[entry] = 1
+            state.touched[clock[CLOCK_TOUCHED]] = np.ravel_multi_index(entry, on_stack.shape)
             clock[CLOCK_TOUCHED] += 1
 
 
@@ -399,12 +406,6 @@ def quadrant(volume, shape):
     return [[0, 1], [2, 3]][is_low][is_right]
 
 
-def covering(pixel, count, operator):
-    starts = np.arange(count) * operator.stride
-    volumes = np.flatnonzero((starts <= pixel) & (pixel < starts + operator.patch))
-    return (volumes[0], volumes[-1] + 1) if len(volumes) else (0, 0)
-
-
 def encode_volume(projection, moments, atoms, fresh, part, operator, state):
     code = state.code[part, 0]
     if moments[MOMENT_SQUARES] == 0:
@@ -445,11 +446,11 @@ def read_features(operator, state, features):
 
 def _gather(ring, ahead, volume, shape, operator, state):
     """Entries of a volume as they are after `ahead` more bins."""
-    n_bins, now = len(ring), int(state.clock[CLOCK_NOW])
+    n_bins = len(ring)
     top, left = (index * operator.stride for index in divmod(volume, shape[1]))
     values = np.zeros(state.values.shape[1], np.int64)
     end = (n_bins - ahead) * operator.patch**2
-    gather_volume(ring, (now + 1 + ahead) % n_bins, end, top, left, operator.patch, values)
+    gather_volume(ring, slot_of(ahead, state), end, top, left, operator.patch, values)
     return values
 
 
@@ -599,35 +600,35 @@ def move_volume(plane, volume, entry, change, shape, operator, state):
     change_volume(plane, volume, entry, change, shape, operator, state)
 
 
-def change_place(place, shape, operator, state):
-    after = state.applied.copy()
-    after.reshape(-1)[place] = _clipped(operator, state).reshape(-1)[place]
+def change_place(position, row, column, shape, operator, state):
+    after, entry = state.applied.copy(), (slot_of(position, state), row, column)
+    after[entry] = _clipped(operator, state)[entry]
     for plane, volume, values in list(_changed_volumes(after, shape, operator, state)):
         _follow_volume(plane, volume, values, 0, shape, operator, state)
     state.applied[:] = after
 
 
-def follow(events, height, width, shape, operator, state):
+def follow(events, shape, operator, state):
     for event in events.tolist():
-        follow_event(*event, height, width, shape, operator, state)
+        follow_event(*event, shape, operator, state)
 
 
-def trace(events, height, width, shape, operator, state, features, accepted):
+def trace(events, shape, operator, state, features, accepted):
     for i, event in enumerate(events.tolist()):
-        follow_event(*event, height, width, shape, operator, state)
+        follow_event(*event, shape, operator, state)
         read_features(operator, state, features[i])
         accepted[i] = state.tally[TALLY_EVENTS]
 
 
-def follow_event(x, y, p, t, height, width, shape, operator, state):
+def follow_event(x, y, p, t, shape, operator, state):
     n_volumes = shape[0] * shape[1]
-    place = count_event(x, y, p, t, height, width, operator, state)
+    position, row, column = count_event(x, y, p, t, operator, state)
     if state.cursors[int(state.clock[CLOCK_PLANE]), CURSOR_CODED] < n_volumes:
         for part in range(2):
             complete(part, shape, operator, state)
         finish(shape, state)
-    if place >= 0:
-        change_place(place, shape, operator, state)
+    if position >= 0:
+        change_place(position, row, column, shape, operator, state)
     if len(state.cursors) == 2:
         share = float(np.clip((t - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
         goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])

@@ -26,8 +26,9 @@ from streamfeat.kernels.layout import (
 @inlined
 def deviation(moments: NDArray[np.int64], entries: int, eps: float) -> float:
     """Standard deviation of a volume's entries, `sqrt(mean of squares - square of mean + eps)`."""
-    mean = moments[MOMENT_SUM] / entries
-    return math.sqrt(moments[MOMENT_SQUARES] / entries - mean * mean + eps)
+    share = 1.0 / entries  # the same for all volumes: divided once, not four times an event
+    mean = moments[MOMENT_SUM] * share
+    return math.sqrt(moments[MOMENT_SQUARES] * share - mean * mean + eps)
 
 
 @inlined

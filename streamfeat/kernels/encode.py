@@ -29,13 +29,6 @@ def quadrant(volume: int, shape: tuple[int, int]) -> int:
     return 2 * (volume >= lower_half(shape)) + (2 * column >= shape[1])
 
 
-@inlined
-def covering(pixel: int, count: int, operator: Operator) -> tuple[int, int]:
-    """First and last plus one of the `count` volumes along one axis that cover a pixel."""
-    first = max(0, (pixel - operator.patch + operator.stride) // operator.stride)
-    return first, min(count, pixel // operator.stride + 1)
-
-
 @kernel
 def encode_volume(
     projection: NDArray[np.int32],

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from streamfeat.events import Events
 from streamfeat.kernels.code import deviation, gain, move_code, move_triangle, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
-from streamfeat.kernels.encode import ADD, TAKE, covering, pool_volume, quadrant, read_features
-from streamfeat.kernels.ingest import UNCHANGED, count_event
+from streamfeat.kernels.encode import ADD, TAKE, pool_volume, quadrant, read_features
+from streamfeat.kernels.ingest import UNCHANGED, count_event, slot_of
 from streamfeat.kernels.layout import (
-    CLOCK_NOW,
     CLOCK_PLANE,
     CLOCK_START,
     CURSOR_CODED,
@@ -119,28 +118,29 @@ def move_volume(
 
 
 @inlined
-def change_place(place: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
+def change_place(
+    position: int, row: int, column: int, shape: tuple[int, int], operator: Operator, state: State
+) -> None:
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
     Args:
-        place: flat index of the entry, whose clipped count went up or down by one.
+        position: bin of the entry in the window, oldest first; its clipped count went up or down by one.
+        row: of the entry in the ring.
+        column: of the entry in the ring.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: planes, `applied` and scratch are changed.
     """
-    n_bins, height, width = state.counts.shape
-    patch, now, limit = operator.patch, state.clock[CLOCK_NOW], operator.max_count
-    applied, counts = state.applied.reshape(-1), state.counts.reshape(-1)
-    before = np.int64(applied[place])
-    after = min(max(np.int64(counts[place]), -limit), limit)
-    row, column = place // width % height, place % width
-    first_row, last_row = covering(row, shape[0], operator)
-    first_column, last_column = covering(column, shape[1], operator)
+    n_bins, patch, limit = state.counts.shape[0], operator.patch, operator.max_count
+    slot = slot_of(position, state)
+    before = np.int64(state.applied[slot, row, column])
+    after = min(max(np.int64(state.counts[slot, row, column]), -limit), limit)
+    first_row, last_row = state.volume_rows[row, 0], state.volume_rows[row, 1]
+    first_column, last_column = state.volume_columns[column, 0], state.volume_columns[column, 1]
     for plane in range(state.cursors.shape[0]):
+        # A plane that is ahead has moved on by a bin.
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
-        # The oldest bin of the window is at position 0 of a volume.
-        position = (place // (height * width) - now - 1) % n_bins - ahead
-        if position < 0:
+        if position < ahead:
             continue
         coded, projected = state.cursors[plane, CURSOR_CODED], state.cursors[plane, CURSOR_PROJECTED]
         last_entry = state.cursors[plane, CURSOR_ENTRY]
@@ -148,14 +148,14 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
             for c in range(first_column, last_column):
                 volume = r * shape[1] + c
                 top, left = r * operator.stride, c * operator.stride
-                entry = (position * patch + row - top) * patch + column - left
+                entry = ((position - ahead) * patch + row - top) * patch + column - left
                 if volume > projected or (volume == projected and entry >= last_entry):
                     continue
                 if operator.quadratic.shape[0]:
                     end = (n_bins - ahead) * patch * patch
                     if volume == projected:
                         end = last_entry
-                    first_slot = (now + 1 + ahead) % n_bins
+                    first_slot = slot_of(ahead, state)
                     gather_volume(state.applied, first_slot, end, top, left, patch, state.values[0])
                 state.values[0, entry] = before
                 squares = state.moments[plane, volume, MOMENT_SQUARES]
@@ -164,7 +164,7 @@ def change_place(place: int, shape: tuple[int, int], operator: Operator, state: 
                     move_volume(plane, volume, entry, after - before, shape, operator, state)
                 else:
                     change_volume(plane, volume, entry, after - before, shape, operator, state)
-    applied[place] = after
+    state.applied[slot, row, column] = after
 
 
 @inlined
@@ -173,8 +173,6 @@ def follow_event(
     y: int,
     p: int,
     t: int,
-    height: int,
-    width: int,
     shape: tuple[int, int],
     operator: Operator,
     state: State,
@@ -188,20 +186,18 @@ def follow_event(
         y: row in pixels, any value.
         p: polarity, any value.
         t: stream time in microseconds, any value.
-        height: rows of the sensor, pixels.
-        width: columns of the sensor, pixels.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: all of it may be changed. Nothing may be on the touched stack.
     """
     n_volumes = shape[0] * shape[1]
-    place = count_event(x, y, p, t, height, width, operator, state)
+    position, row, column = count_event(x, y, p, t, operator, state)
     if state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED] < n_volumes:
         for part in range(PARTS):
             complete(part, shape, operator, state)
         finish(shape, state)
-    if place != UNCHANGED:
-        change_place(place, shape, operator, state)
+    if position != UNCHANGED:
+        change_place(position, row, column, shape, operator, state)
     if state.cursors.shape[0] > 1:
         share = min(max((t - state.clock[CLOCK_START]) / operator.bin_us, 0.0), 1.0)
         projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
@@ -212,29 +208,23 @@ def follow_event(
 
 
 @kernel
-def follow(
-    events: Events, height: int, width: int, shape: tuple[int, int], operator: Operator, state: State
-) -> None:
+def follow(events: Events, shape: tuple[int, int], operator: Operator, state: State) -> None:
     """Follow every event of a batch, one by one.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
-        height: rows of the sensor, pixels.
-        width: columns of the sensor, pixels.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: as for `follow_event`.
     """
     for i in range(events.shape[0]):
         event = events[i]
-        follow_event(event.x, event.y, event.p, event.t, height, width, shape, operator, state)
+        follow_event(event.x, event.y, event.p, event.t, shape, operator, state)
 
 
 @kernel
 def trace(
     events: Events,
-    height: int,
-    width: int,
     shape: tuple[int, int],
     operator: Operator,
     state: State,
@@ -245,8 +235,6 @@ def trace(
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
-        height: rows of the sensor, pixels.
-        width: columns of the sensor, pixels.
         shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: as for `follow_event`.
@@ -255,6 +243,6 @@ def trace(
     """
     for i in range(events.shape[0]):
         event = events[i]
-        follow_event(event.x, event.y, event.p, event.t, height, width, shape, operator, state)
+        follow_event(event.x, event.y, event.p, event.t, shape, operator, state)
         read_features(operator, state, features[i])
         accepted[i] = state.tally[TALLY_EVENTS]

@@ -16,6 +16,7 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CLOCK_SLOT,
     CLOCK_START,
     CLOCK_TOUCHED,
     TALLY_EVENTS,
@@ -28,7 +29,7 @@ from streamfeat.kernels.layout import (
 )
 
 UNCHANGED = -1
-"""Instead of a place: no clipped count changed."""
+"""Instead of the position of a bin: no clipped count changed."""
 
 
 @kernel
@@ -49,6 +50,7 @@ def advance_to_bin(new: int, operator: Operator, state: State) -> None:
     if now > BEFORE_TIME:
         state.tally[TALLY_ROLLS] += new - now
     clock[CLOCK_NOW] = new
+    clock[CLOCK_SLOT] = new % n_bins
     clock[CLOCK_START] = clock[CLOCK_ORIGIN] + new * operator.bin_us
     next_plane = (clock[CLOCK_PLANE] + 1) % n_planes
     for plane in range(n_planes):
@@ -59,9 +61,7 @@ def advance_to_bin(new: int, operator: Operator, state: State) -> None:
 
 
 @inlined
-def count_event(
-    x: int, y: int, p: int, t: int, height: int, width: int, operator: Operator, state: State
-) -> int:
+def count_event(x: int, y: int, p: int, t: int, operator: Operator, state: State) -> tuple[int, int, int]:
     """Count one event in its pixel and bin.
 
     Args:
@@ -69,79 +69,77 @@ def count_event(
         y: row in pixels, any value.
         p: polarity, any value.
         t: stream time in microseconds, any value.
-        height: rows of the sensor, pixels.
-        width: columns of the sensor, pixels.
         operator: geometry is read from it.
         state: `counts`, `clock` and `tally` are changed, and the planes where a bin begins.
 
     Returns:
-        the flat index of the entry whose clipped count changed by `2 p - 1`, or UNCHANGED.
+        the entry whose clipped count changed by `2 p - 1`: its bin in the window, oldest first, and its row
+        and column in the ring. The bin is UNCHANGED if there is none.
     """
     counts, clock, tally = state.counts, state.clock, state.tally
     n_bins, limit = counts.shape[0], operator.max_count
-    if x >= width or y >= height or p < 0 or p > 1 or t <= BEFORE_TIME or t >= -BEFORE_TIME:
+    inside = x < state.ring_columns.shape[0] and y < state.ring_rows.shape[0]
+    if not inside or p < 0 or p > 1 or t <= BEFORE_TIME or t >= -BEFORE_TIME:
         tally[TALLY_REJECTED] += 1
-        return UNCHANGED
-    bin_index = clock[CLOCK_NOW]
+        return UNCHANGED, 0, 0
+    position = n_bins - 1
     # Most events fall into the current bin: a division for each would cost as much as all the rest.
-    if bin_index == BEFORE_TIME or t < clock[CLOCK_START] or t - clock[CLOCK_START] >= operator.bin_us:
+    if clock[CLOCK_NOW] == BEFORE_TIME or t < clock[CLOCK_START] or t - clock[CLOCK_START] >= operator.bin_us:
         bin_index = (t - clock[CLOCK_ORIGIN]) // operator.bin_us
         advance_to_bin(bin_index, operator, state)
-        if bin_index <= clock[CLOCK_NOW] - n_bins:
+        position = bin_index - clock[CLOCK_NOW] + n_bins - 1
+        if position < 0:
             tally[TALLY_LATE] += 1
-            return UNCHANGED
+            return UNCHANGED, 0, 0
     tally[TALLY_EVENTS] += 1
-    slot = bin_index % n_bins
-    # In 32 bits without a sign, where a division takes a third of the time.
-    row = np.int64(np.uint32(y) // np.uint32(operator.downsample))
-    column = np.int64(np.uint32(x) // np.uint32(operator.downsample))
+    slot, row, column = slot_of(position, state), int(state.ring_rows[y]), int(state.ring_columns[x])
     before = counts[slot, row, column]
     after = before + 2 * p - 1
     counts[slot, row, column] = after
     if min(max(before, -limit), limit) == min(max(after, -limit), limit):
         tally[TALLY_SATURATED] += 1
-        return UNCHANGED
-    return (slot * counts.shape[1] + row) * counts.shape[2] + column
+        return UNCHANGED, 0, 0
+    return position, row, column
 
 
 @inlined
-def current_slot(state: State) -> tuple[int, np.uint64]:
-    """When the current bin began, and the flat index at which its slot begins; before all time, never."""
-    now = state.clock[CLOCK_NOW]
-    if now == BEFORE_TIME:
-        return -BEFORE_TIME, np.uint64(0)
-    n_bins, height, width = state.counts.shape
-    return int(state.clock[CLOCK_START]), np.uint64(now % n_bins * height * width)
+def slot_of(position: int, state: State) -> int:
+    """The slot of a bin of the window; the oldest is at position 0."""
+    slot = state.clock[CLOCK_SLOT] + 1 + position
+    n_bins = state.counts.shape[0]
+    return slot if slot < n_bins else slot - n_bins
+
+
+@inlined
+def start_of_bin(state: State) -> int:
+    """When the current bin began; before all time, later than any event."""
+    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] > BEFORE_TIME else -BEFORE_TIME
 
 
 @kernel
-def count_events(events: Events, height: int, width: int, operator: Operator, state: State) -> None:
+def count_events(events: Events, operator: Operator, state: State) -> None:
     """Count every event of a batch, and note the entries that changed for the next reading.
 
     Same as `count_event` on each; the events of the current bin, which are nearly all, go a shorter way.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
-        height: rows of the sensor, pixels.
-        width: columns of the sensor, pixels.
         operator: geometry is read from it.
         state: as for `count_event`; `touched` and `is_touched` are changed too.
     """
     counts, flags = state.counts.reshape(-1), state.is_touched.reshape(-1)
-    touched, tally, limit = state.touched, state.tally, operator.max_count
-    # Exact for 16 bits, and a tenth of the time of a division.
-    reciprocal = np.uint64((1 << 32) // operator.downsample + 1)
-    row_length, bin_us = np.uint64(state.counts.shape[2]), np.uint64(operator.bin_us)
-    start, first = current_slot(state)
-    n_touched, n_saturated = np.uint64(state.clock[CLOCK_TOUCHED]), 0
+    touched, tally, limit, clock = state.touched, state.tally, operator.max_count, state.clock
+    rows, columns = state.ring_rows, state.ring_columns
+    row_length, slot_length = state.counts.shape[2], state.counts.shape[1] * state.counts.shape[2]
+    start, first = start_of_bin(state), clock[CLOCK_SLOT] * slot_length
+    n_touched, n_saturated = clock[CLOCK_TOUCHED], 0
     for i in range(events.shape[0]):
         event = events[i]
         x, y, p, t = event.x, event.y, event.p, event.t
-        sound = x < width and y < height and p >> 1 == 0 and BEFORE_TIME < t < -BEFORE_TIME
-        if sound and np.uint64(t - start) < bin_us:
+        sound = x < columns.shape[0] and y < rows.shape[0] and p >> 1 == 0 and BEFORE_TIME < t < -BEFORE_TIME
+        if sound and np.uint64(t - start) < np.uint64(operator.bin_us):
             # Unsigned, or every index would be tested for being below zero.
-            row, column = np.uint64(y) * reciprocal >> 32, np.uint64(x) * reciprocal >> 32
-            place = first + row * row_length + column
+            place = np.uint64(first + rows[y] * row_length + columns[x])
             before = counts[place]
             after = before + 2 * p - 1
             counts[place] = after
@@ -149,15 +147,16 @@ def count_events(events: Events, height: int, width: int, operator: Operator, st
             tally[TALLY_EVENTS] += 1
             n_saturated += not changed
             # Always on the stack, and kept or not: whether a count saturates cannot be predicted.
-            touched[n_touched] = place
-            n_touched += np.uint64(changed & (flags[place] == 0))
+            touched[np.uint64(n_touched)] = place
+            n_touched += changed & (flags[place] == 0)
             flags[place] |= changed
             continue
-        other = count_event(x, y, p, t, height, width, operator, state)
-        start, first = current_slot(state)
-        if other != UNCHANGED and flags[other] == 0:
-            flags[other] = 1
+        position, row, column = count_event(x, y, p, t, operator, state)
+        start, first = start_of_bin(state), clock[CLOCK_SLOT] * slot_length
+        if position != UNCHANGED:
+            other = slot_of(position, state) * slot_length + row * row_length + column
             touched[n_touched] = other
-            n_touched += np.uint64(1)
-    state.clock[CLOCK_TOUCHED] = n_touched
+            n_touched += flags[other] == 0
+            flags[other] = 1
+    clock[CLOCK_TOUCHED] = n_touched
     tally[TALLY_SATURATED] += n_saturated

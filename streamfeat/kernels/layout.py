@@ -88,8 +88,16 @@ class State(NamedTuple):
     """`(T, H, W)`: whether an entry is on that stack."""
     touched_slots: NDArray[np.uint8]
     """`(T,)`: scratch, slots in which an entry is on that stack."""
+    ring_rows: NDArray[np.int32]
+    """`(height,)`: row of the ring for each row of the sensor; a table, for a division costs more."""
+    ring_columns: NDArray[np.int32]
+    """`(width,)`: the same for columns."""
+    volume_rows: NDArray[np.int32]
+    """`(H, 2)`: first and last plus one of the rows of volumes that cover a row of the ring."""
+    volume_columns: NDArray[np.int32]
+    """`(W, 2)`: the same for columns."""
     clock: NDArray[np.int64]
-    """`(6,)`: see the CLOCK_* slots."""
+    """`(7,)`: see the CLOCK_* slots."""
     cursors: NDArray[np.int64]
     """`(planes, 3)`: see the CURSOR_* slots."""
     tally: NDArray[np.int64]
@@ -129,9 +137,9 @@ class State(NamedTuple):
 PARTS = 2
 """The upper and the lower half of the grid of volumes."""
 
-CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE, CLOCK_DIRTY = range(6)
+CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE, CLOCK_DIRTY, CLOCK_SLOT = range(7)
 """Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane; height
-of the dirty stack."""
+of the dirty stack; slot of the current bin."""
 
 CURSOR_CODED, CURSOR_PROJECTED, CURSOR_ENTRY = range(3)
 """Volumes below the first have a code in the plane, those below the second a projection; of the volume at the

@@ -14,9 +14,9 @@ import numpy as np
 
 from streamfeat.kernels.compiled import kernel
 from streamfeat.kernels.encode import ADD, lower_half, pool_volume
+from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.lasso import respond
 from streamfeat.kernels.layout import (
-    CLOCK_NOW,
     CLOCK_PLANE,
     CURSOR_CODED,
     CURSOR_ENTRY,
@@ -71,7 +71,7 @@ def project_volume(
     n_bins, patch = state.applied.shape[0], operator.patch
     end = (n_bins - ahead) * patch * patch
     top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
-    first_slot = (state.clock[CLOCK_NOW] + 1 + ahead) % n_bins
+    first_slot = slot_of(ahead, state)
     n, following = list_filled(
         state.applied, first_slot, start, end, most, top, left, patch, entries, changes
     )

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, TAKE, covering, lower_half, pool_volume, read_features
+from streamfeat.kernels.encode import ADD, TAKE, lower_half, pool_volume, read_features
+from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.layout import (
     CLOCK_DIRTY,
-    CLOCK_NOW,
     CLOCK_PLANE,
+    CLOCK_SLOT,
     CLOCK_TOUCHED,
     CURSOR_CODED,
     CURSOR_ENTRY,
@@ -40,7 +41,7 @@ def mark_dirty(shape: tuple[int, int], operator: Operator, state: State) -> None
     """
     n_bins, height, width = state.counts.shape
     applied, counts, limit = state.applied.reshape(-1), state.counts.reshape(-1), operator.max_count
-    n_volumes, patch, now = shape[0] * shape[1], operator.patch, state.clock[CLOCK_NOW]
+    n_volumes, patch = shape[0] * shape[1], operator.patch
     state.touched_slots[:] = 0
     n_dirty = 0
     for i in range(state.clock[CLOCK_TOUCHED]):
@@ -50,11 +51,13 @@ def mark_dirty(shape: tuple[int, int], operator: Operator, state: State) -> None
         slot = place // (height * width)
         state.touched_slots[slot] = 1
         row, column = place // width % height, place % width
-        first_row, last_row = covering(row, shape[0], operator)
-        first_column, last_column = covering(column, shape[1], operator)
+        first_row, last_row = state.volume_rows[row]
+        first_column, last_column = state.volume_columns[column]
         for plane in range(state.cursors.shape[0]):
             # The oldest bin of the window is at position 0 of a volume.
-            position = (slot - now - 1) % n_bins - np.int64(plane != state.clock[CLOCK_PLANE])
+            position = (slot - state.clock[CLOCK_SLOT] - 1) % n_bins - np.int64(
+                plane != state.clock[CLOCK_PLANE]
+            )
             last, last_entry = state.cursors[plane, CURSOR_PROJECTED], state.cursors[plane, CURSOR_ENTRY]
             if position < 0:
                 continue
@@ -95,7 +98,7 @@ def renew(part: int, shape: tuple[int, int], operator: Operator, state: State) -
         if volume == cursors[CURSOR_PROJECTED]:
             end = cursors[CURSOR_ENTRY]
         top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
-        first_slot = (state.clock[CLOCK_NOW] + 1 + ahead) % n_bins
+        first_slot = slot_of(ahead, state)
         if operator.quadratic.shape[0]:
             gather_volume(state.applied, first_slot, end, top, left, patch, values)
         n = list_changed(

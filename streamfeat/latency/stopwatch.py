@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from streamfeat.engine import Engine
-from streamfeat.events import Events, Resolution
+from streamfeat.events import Events
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, Operator, State
 
@@ -47,7 +47,6 @@ def follow_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDA
     stamps, bins = np.empty((2, len(events) + 1), np.int64)
     _walk(
         events,
-        engine.resolution,
         engine.grid_shape,
         engine._operator,
         engine._state,
@@ -86,7 +85,6 @@ def _tick(timespec: Stamps, stamps: Stamps) -> None:
 @njit(nogil=True)
 def _walk(
     events: Events,
-    resolution: Resolution,
     shape: tuple[int, int],
     operator: Operator,
     state: State,
@@ -97,6 +95,6 @@ def _walk(
     bins[0] = state.clock[CLOCK_NOW]
     stamps[0] = _now(timespec)
     for i in range(events.shape[0]):
-        follow(events[i : i + 1], resolution[0], resolution[1], shape, operator, state)
+        follow(events[i : i + 1], shape, operator, state)
         bins[i + 1] = state.clock[CLOCK_NOW]
         stamps[i + 1] = _now(timespec)
