@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from streamfeat.cli.program import (
     JsonOption,
@@ -17,6 +18,7 @@ from streamfeat.cli.program import (
     RecordingsArgument,
     TopicOption,
     app,
+    err,
     print_losses,
     print_result,
     progress_bars,
@@ -46,31 +48,45 @@ def learn(
     volumes: Annotated[int, typer.Option(help="Local volumes to learn from.")] = 50_000,
     iterations: Annotated[int, typer.Option(help="Alternations at most.")] = 20,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    resume: Annotated[
+        Path | None,
+        typer.Option(help="Go on from this model; recordings and all other options as it was learned with."),
+    ] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Learn features without labels; samples of validation and test splits are not looked at."""
+    """Learn features without labels; samples of validation and test splits are not looked at.
+
+    Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
+    """
+    from streamfeat.encoder import Encoder
     from streamfeat.geometry import Geometry
     from streamfeat.learn.fit import bin_length, learn_encoder
     from streamfeat.recording import open_recording
 
-    refuse_existing(model, overwrite=overwrite)
-    with contextlib.ExitStack() as files, progress_bars() as report:
-        opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
-        geometry = Geometry(patch, stride, bins, bin_length(opened, bins, window_ms), downsample, max_count)
-        encoder = learn_encoder(
-            opened,
-            geometry,
-            formulation=formulation,  # type: ignore[arg-type]
-            encoding=encoding,  # type: ignore[arg-type]
-            n_filters=filters,
-            threshold=threshold,
-            n_volumes=volumes,
-            max_iter=iterations,
-            seed=seed,
-            report=report,
-        )
+    refuse_existing(model, overwrite=overwrite or model == resume)
+    before = Encoder.load(resume) if resume else None
+    try:
+        with contextlib.ExitStack() as files, progress_bars() as report:
+            opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
+            bin_us = bin_length(opened, bins, window_ms)
+            encoder = learn_encoder(
+                opened,
+                Geometry(patch, stride, bins, bin_us, downsample, max_count),
+                formulation=formulation,  # type: ignore[arg-type]
+                encoding=encoding,  # type: ignore[arg-type]
+                n_filters=filters,
+                threshold=threshold,
+                n_volumes=volumes,
+                max_iter=iterations,
+                seed=seed,
+                resume=before,
+                report=report,
+            )
+    except KeyboardInterrupt:
+        err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
+        raise typer.Exit(130) from None
     encoder.save(model)
     result = {
         "written": str(model),
@@ -81,11 +97,23 @@ def learn(
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
         "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
+        "condition": encoder.provenance["condition"][-1],
+        "coherence": encoder.provenance["coherence"][-1],
         "bytes": model.stat().st_size,
     }
+    entries = encoder.geometry.entries
+    if formulation == "direct" and filters < entries:
+        result["log_determinant"] = f"that of A A', since {filters} filters are fewer than {entries} entries"
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
         print_losses(rec.losses)
+    if encoder.provenance["interrupted"]:
+        err.print(
+            f"[yellow]interrupted[/] after {encoder.provenance['iterations']} iterations; "
+            f"the same command with --resume {escape(str(model))} goes on from there",
+            soft_wrap=True,
+        )
+        raise typer.Exit(130)
 
 
 @app.command(

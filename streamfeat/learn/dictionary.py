@@ -1,177 +1,241 @@
 """The inverse formulation: an overcomplete dictionary.
 
-Lives here: `DictionaryLearner`. Not here: the lasso itself (`kernels.lasso`), sampling and whitening.
+Lives here: `DictionaryLearner`. Not here: the loop (`alternation`), the lasso itself (`kernels.lasso`).
 """
 
-from collections.abc import Callable
-from typing import Any, Self
+from collections.abc import Iterator
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
-from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted, validate_data
+from scipy.sparse import csr_array
+from sklearn.utils.validation import check_is_fitted
 
 from streamfeat.errors import InputError
 from streamfeat.kernels.lasso import solve_lasso_rows
-from streamfeat.learn.initial import random_directions
+from streamfeat.learn.alternation import Alternation, Step
+from streamfeat.learn.chunks import LazyVolumes, Rows, checked_rows, chunks, squared_lengths
+from streamfeat.learn.omega import Omega
 
 __all__ = ["DictionaryLearner"]
 
-Progress = Callable[[int, float], None]
+_UNUSED = 1e-12
+"""Mean square of an atom's codes at which no volume uses it."""
 
 
-class DictionaryLearner(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Learn `D` of `min over D, L of 1/2 |X - D L|_F^2 + lambda0 |L|_1`, atoms of unit length.
+@dataclass(slots=True)
+class _Sums:
+    """Means over volumes: all that the dictionary half-step needs to know of volumes and codes."""
 
-    Kostadinov and Scaramuzza (ICPR 2020/21), inverse problem formulation, by alternating minimisation;
-    the data terms are means over volumes. Codes are lassos, solved to a duality gap from the codes before
-    them. The dictionary is updated one atom at a time from the sums `L L'` and `X L'` (Mairal et al. 2010,
-    algorithm 2), and an atom that no volume uses is replaced by the volume that is represented worst.
-    The length of atoms stands in for the conditioning term of `Omega`; its coherence and determinant terms
-    are not part of this objective.
+    gram: NDArray[np.float64]  # L L' / n, (K, K)
+    cross: NDArray[np.float64]  # L X' / n, (K, d)
+    l1: NDArray[np.float64]  # mean of |l_k|, (K,)
+
+    def objective(self, atoms: NDArray[np.float64], penalty: float) -> float:
+        """`1/2 |X - D L|^2 - 1/2 |X|^2 + penalty |L|_1`."""
+        fit = 0.5 * np.sum((self.gram @ atoms) * atoms) - np.sum(self.cross * atoms)
+        return float(fit + penalty * self.l1.sum())
+
+    def scale(self, j: int, factor: float) -> None:
+        """Let the codes of atom `j` be that many times what they were."""
+        self.gram[j] *= factor
+        self.gram[:, j] *= factor
+        self.cross[j] *= factor
+        self.l1[j] *= factor
+
+
+@dataclass(eq=False, repr=False)
+class DictionaryLearner(Alternation):
+    """Learn `D` of `min over D, L of 1/2 |X - D L|_F^2 + lambda0 |L|_1 + lambda1 Omega(D)`, unit atoms.
+
+    Kostadinov and Scaramuzza (ICPR 2020/21), inverse problem formulation, by alternating minimisation; the
+    data terms are means over volumes. Codes are lassos, solved to a duality gap from the codes before them.
+
+    The dictionary half-step is the approximate K-SVD of Rubinstein, Zibulevsky and Elad (2008, algorithm 5):
+    atom after atom becomes `d_j = E_j l_j / |E_j l_j|`, where `E_j` is what the others leave of the volumes
+    and `l_j` the atom's codes, and then the codes are fitted to the new atom. Two deviations: `E_j l_j`
+    comes from the sums `L L'` and `L X'`, so that no residual of all volumes is kept; and the codes are only
+    rescaled, to the minimum of fit and `lambda0 |l_j|_1`, since the lasso solves them again at once.
+
+    Of `Omega` (`learn.omega.Omega`) the coherence term is taken along in each atom's step, by a quadratic
+    that lies above it and touches it at the atom before: `d_j` is the direction of
+    `E_j l_j + coherence (s d_j - G_j d_j)`, `G_j` the sum of `d d'` over the other atoms and `s` its largest
+    eigenvalue, and is left as it was where that would raise the objective. The other two terms have nothing
+    to add: for atoms of unit length `|D|_F^2` is `K`, and both the determinant and the coherence term are
+    best where all singular values are equal, a tight frame with condition number one.
+
+    No half-step raises the objective. After an iteration an atom that no volume uses becomes the volume that
+    is represented worst, which does not touch fit and codes, but may raise the coherence term.
+
+    State: `2 K^2 + 2 K d` float64, 8 bytes for each code that is not zero, 16 bytes for each volume, and for
+    each of `chunk_size` volumes `3 K + d` float32; volumes are walked through in chunks.
 
     Args:
         n_atoms: `K`.
         threshold: `lambda0`, above zero.
-        max_iter: alternations.
-        tol: stop when the objective falls by less than this share.
+        coherence: weight of `|D D' - I|_F^2 / 4`.
         gap: relative duality gap of the codes.
+        max_iter: iterations at most, each of two half-steps.
+        tol: stop when an iteration lowers the objective by less than this share.
         chunk_size: volumes whose codes are held as floats at a time.
+        warm_start: start from `components_` of the fit before; codes start from zero.
         random_state: seed of the initial dictionary.
         progress: called with (iteration, objective) after each iteration.
 
     Attributes:
         components_: `(K, d)` float32, the atoms as rows, `D'`.
-        objective_: `(2 n_iter_,)` the objective after each half-step (codes, dictionary).
-        replaced_: atoms replaced in all.
-        n_iter_: iterations done.
+        objective_: `(2 n_iter_,)` the objective after each half-step (codes, dictionary) of this fit.
+        condition_: `(n_iter_,)` ratio of the largest to the smallest singular value of `D`.
+        coherence_: `(n_iter_,)` largest `|cos|` between two atoms.
+        replaced_: atoms replaced in this fit.
+        n_iter_: iterations done in this fit.
+        interrupted_: whether Ctrl-C ended it.
     """
 
-    def __init__(
-        self,
-        n_atoms: int = 400,
-        *,
-        threshold: float = 1.0,
-        max_iter: int = 10,
-        tol: float = 1e-3,
-        gap: float = 1e-3,
-        chunk_size: int = 8192,
-        random_state: int | None = None,
-        progress: Progress | None = None,
-    ) -> None:
-        """Keep the parameters."""
-        self.n_atoms = n_atoms
-        self.threshold = threshold
-        self.max_iter = max_iter
-        self.tol = tol
-        self.gap = gap
-        self.chunk_size = chunk_size
-        self.random_state = random_state
-        self.progress = progress
+    n_atoms: int = 400
+    _: KW_ONLY
+    threshold: float = 1.0
+    coherence: float = 0.0
+    gap: float = 1e-3
+    tol: float = 1e-3
 
-    def fit(self, X: ArrayLike, y: Any = None) -> Self:
-        """Learn from `(n, d)` whitened volumes.
-
-        Raises:
-            InputError: threshold is not above zero, or there is only one volume.
-        """
-        white = validate_data(self, X, dtype=np.float32)
-        if not self.threshold > 0:
-            raise InputError(f"threshold is {self.threshold}, it must be above zero")
-        if len(white) < 2:
-            raise InputError(f"{len(white)} sample is too few to learn from")
-        atoms = random_directions(white, self.n_atoms, check_random_state(self.random_state))
-        codes = np.zeros((len(white), self.n_atoms), np.float32)
-        energy = 0.5 * float(np.square(white, dtype=np.float64).sum()) / len(white)
-        objective: list[float] = []
-        self.replaced_ = 0
-        for iteration in range(self.max_iter):
-            self._code(white, atoms, codes)
-            gram, cross, l1 = self._sums(white, codes)
-            objective.append(energy + self._fit(atoms, gram, cross) + self.threshold * l1)
-            atoms = self._update_atoms(atoms, gram, cross)
-            objective.append(energy + self._fit(atoms, gram, cross) + self.threshold * l1)
-            if self.progress:
-                self.progress(iteration + 1, objective[-1])
-            if len(objective) > 2 and objective[-3] - objective[-1] <= self.tol * abs(objective[-3]):
-                break
-            self._replace_unused(white, atoms, codes, gram)
-        self.components_ = atoms
-        self.objective_ = np.array(objective)
-        self.n_iter_ = len(objective) // 2
-        return self
-
-    def transform(self, X: ArrayLike) -> NDArray[np.float32]:
+    def transform(self, X: ArrayLike | LazyVolumes) -> NDArray[np.float32]:
         """Lasso codes `(n, K)` of `(n, d)` whitened volumes."""
         check_is_fitted(self)
-        white = validate_data(self, X, dtype=np.float32, reset=False)
-        codes = np.zeros((len(white), self.n_atoms), np.float32)
-        self._code(white, self.components_, codes)
+        volumes = checked_rows(self, X, reset=False)
+        squares = squared_lengths(volumes, self.chunk_size)
+        codes = np.zeros((volumes.shape[0], len(self.components_)), np.float32)
+        gram = _inner_products(self.components_)
+        for where, chunk in chunks(volumes, self.chunk_size):
+            # In float64, so that a code does not depend on how many are computed with it.
+            right = (chunk.astype(np.float64) @ self.components_.T).astype(np.float32)
+            solve_lasso_rows(right, squares[where], float(self.threshold), gram, self.gap, codes[where])
         return codes
 
-    def __sklearn_tags__(self) -> Any:
-        """Say that codes are float32 whatever goes in."""
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = []
-        return tags
+    @property
+    def _n_rows(self) -> int:
+        return self.n_atoms
+
+    def _check(self, n_volumes: int) -> None:
+        if not 0 < self.threshold < np.inf:
+            raise InputError(f"threshold is {self.threshold}, it must be finite and above zero")
+        if not 0 < self.gap < 1:
+            raise InputError(f"gap is {self.gap}, it must be between zero and one")
+        super()._check(n_volumes)
+
+    def _alternate(
+        self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
+    ) -> Iterator[Step]:
+        omega = Omega(coherence=self.coherence)
+        codes: list[Any] = []
+        scale = np.ones(len(rows), np.float32)
+        energy = 0.5 * float(squares.mean())
+        rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        self.replaced_ = 0
+        while True:
+            sums, errors = self._code(volumes, squares, rows, codes, scale)
+            atoms = rows.astype(np.float64)
+            before = energy + sums.objective(atoms, self.threshold) + omega.value(atoms)
+            scale = _sweep(atoms, sums, self.threshold, self.coherence).astype(np.float32)
+            after = energy + sums.objective(atoms, self.threshold) + omega.value(atoms)
+            rows = atoms.astype(np.float32)
+            yield Step(rows, before, after)
+            unused = np.flatnonzero(np.diag(sums.gram) <= _UNUSED)
+            if len(unused):
+                rows = rows.copy()
+                self.replaced_ += _replace(rows, unused, volumes, squares, errors)
 
     def _code(
-        self, white: NDArray[np.float32], atoms: NDArray[np.float32], codes: NDArray[np.float32]
-    ) -> None:
-        gram = (atoms.astype(np.float64) @ atoms.T.astype(np.float64)).astype(np.float32)
-        for start in range(0, len(white), self.chunk_size):
-            chunk = white[start : start + self.chunk_size]
-            right = chunk @ atoms.T
-            squares = np.square(chunk).sum(axis=1, dtype=np.float64)
-            part = codes[start : start + self.chunk_size]
-            solve_lasso_rows(right, squares, float(self.threshold), gram, self.gap, part)
-
-    def _sums(
-        self, white: NDArray[np.float32], codes: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """`L L' / n`, `L X' / n` and the mean l1 norm of the codes."""
-        k, d = codes.shape[1], white.shape[1]
-        gram, cross, l1 = np.zeros((k, k)), np.zeros((k, d)), 0.0
-        for start in range(0, len(white), self.chunk_size):
-            part = codes[start : start + self.chunk_size]
-            gram += part.T @ part
-            cross += part.T @ white[start : start + self.chunk_size]
-            l1 += float(np.abs(part).sum(dtype=np.float64))
-        return gram / len(white), cross / len(white), l1 / len(white)
-
-    @staticmethod
-    def _fit(atoms: NDArray[np.float32], gram: NDArray[np.float64], cross: NDArray[np.float64]) -> float:
-        wide = atoms.astype(np.float64)
-        return float(0.5 * np.sum((gram @ wide) * wide) - np.sum(cross * wide))
-
-    @staticmethod
-    def _update_atoms(
-        atoms: NDArray[np.float32], gram: NDArray[np.float64], cross: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
-        """Minimise over one atom after the other, each within the unit ball (Mairal 2010, algorithm 2)."""
-        wide = atoms.astype(np.float64)
-        for j in np.flatnonzero(np.diag(gram) > 1e-12):
-            atom = wide[j] + (cross[j] - gram[j] @ wide) / gram[j, j]
-            wide[j] = atom / max(np.linalg.norm(atom), 1.0)
-        return wide.astype(np.float32)
-
-    def _replace_unused(
         self,
-        white: NDArray[np.float32],
-        atoms: NDArray[np.float32],
-        codes: NDArray[np.float32],
-        gram: NDArray[np.float64],
-    ) -> None:
-        """Let unused atoms become the volumes that are represented worst."""
-        unused = np.flatnonzero(np.diag(gram) <= 1e-12)
-        if len(unused) == 0:
-            return
-        looked_at = slice(0, self.chunk_size)
-        errors = np.square(white[looked_at] - codes[looked_at] @ atoms).sum(axis=1)
-        worst = np.argsort(errors)[::-1][: len(unused)]
-        for j, volume in zip(unused, worst, strict=False):
-            length = np.linalg.norm(white[volume])
-            if length > 1e-6:
-                atoms[j] = white[volume] / length
-                self.replaced_ += 1
+        volumes: Rows,
+        squares: NDArray[np.float64],
+        rows: NDArray[np.float32],
+        codes: list[Any],
+        scale: NDArray[np.float32],
+    ) -> tuple[_Sums, NDArray[np.float64]]:
+        """One pass over the volumes: sums, and the squared error of each volume.
+
+        Args:
+            volumes: `(n, d)`.
+            squares: `(n,)` their squared lengths.
+            rows: `(K, d)` atoms.
+            codes: a sparse array for each chunk, or empty; replaced with the new codes.
+            scale: `(K,)` what the dictionary half-step did to the codes.
+        """
+        (n, d), k = volumes.shape, len(rows)
+        sums = _Sums(np.zeros((k, k)), np.zeros((k, d)), np.zeros(k))
+        errors = np.empty(n)
+        gram = _inner_products(rows)
+        solved: list[Any] = []
+        for i, (where, chunk) in enumerate(chunks(volumes, self.chunk_size)):
+            right = chunk @ rows.T
+            part = codes[i].toarray() * scale if codes else np.zeros(right.shape, np.float32)
+            solve_lasso_rows(right, squares[where], float(self.threshold), gram, self.gap, part)
+            sums.gram += part.T @ part
+            sums.cross += part.T @ chunk
+            size = np.abs(part)
+            sums.l1 += size.sum(axis=0, dtype=np.float64)
+            # At the solution l'D'(x - D l) = lambda0 |l|_1.
+            fitted = np.einsum("ik,ik->i", part, right)
+            errors[where] = squares[where] - fitted - self.threshold * size.sum(axis=1)
+            solved.append(csr_array(part))
+        codes[:] = solved
+        for total in (sums.gram, sums.cross, sums.l1):
+            total /= n
+        return sums, errors
+
+
+def _inner_products(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    wide = rows.astype(np.float64)
+    return (wide @ wide.T).astype(np.float32)
+
+
+def _sweep(atoms: NDArray[np.float64], sums: _Sums, penalty: float, coherence: float) -> NDArray[np.float64]:
+    """Minimise over one atom and the scale of its codes after the other.
+
+    Args:
+        atoms: `(K, d)` of unit length, changed.
+        sums: changed, as the codes are scaled.
+        penalty: lambda0.
+        coherence: weight of the coherence term.
+
+    Returns:
+        `(K,)` what the codes of each atom are to be multiplied with, not negative.
+    """
+    scale = np.ones(len(atoms))
+    bound = np.linalg.norm(atoms, 2) ** 2 if coherence else 0.0
+    for j in map(int, np.flatnonzero(np.diag(sums.gram) > _UNUSED)):
+        use = sums.gram[j, j]
+        pull = sums.cross[j] - sums.gram[j] @ atoms + use * atoms[j]
+        found = pull
+        if coherence:
+            cosines = atoms @ atoms[j]
+            found = pull + coherence * (bound * atoms[j] - (cosines @ atoms - atoms[j]))
+        length = np.linalg.norm(found)
+        if length > 0:
+            found = found / length
+            gained = float(pull @ (found - atoms[j]))
+            if coherence:
+                old, new = np.delete(cosines, j), np.delete(atoms @ found, j)
+                gained += 0.5 * coherence * float(old @ old - new @ new)
+            if gained > 0:
+                atoms[j] = found
+        scale[j] = max(float(pull @ atoms[j]) - penalty * sums.l1[j], 0.0) / use
+        sums.scale(j, scale[j])
+    return scale
+
+
+def _replace(
+    rows: NDArray[np.float32],
+    unused: NDArray[np.int64],
+    volumes: Rows,
+    squares: NDArray[np.float64],
+    errors: NDArray[np.float64],
+) -> int:
+    """Let unused atoms become the volumes that are represented worst; how many did."""
+    worst = np.argsort(errors, kind="stable")[::-1][: len(unused)]
+    worst = worst[squares[worst] > 1e-12]
+    lengths = np.sqrt(squares[worst, None])
+    rows[unused[: len(worst)]] = np.asarray(volumes[worst], np.float32) / lengths
+    return len(worst)

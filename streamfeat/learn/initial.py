@@ -9,30 +9,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
+from streamfeat.learn.chunks import Rows
 
 __all__ = ["random_directions"]
 
+_NOISE = 0.01
+"""Length of what is added to a volume of unit length, so that filters span all dimensions: volumes have no
+mean and may repeat, and a transform of less than full rank has no log-determinant."""
 
-def random_directions(white: NDArray[np.float32], n: int, rng: Any) -> NDArray[np.float32]:
-    """`(n, d)` rows of unit length: distinct volumes first, random directions where those run out.
+
+def random_directions(volumes: Rows, squares: NDArray[np.float64], n: int, rng: Any) -> NDArray[np.float32]:
+    """`(n, d)` rows of unit length: distinct volumes, random directions where those run out; a little noise.
 
     Args:
-        white: `(samples, d)` whitened volumes.
+        volumes: `(samples, d)` whitened volumes.
+        squares: `(samples,)` their squared lengths.
         n: rows to make.
         rng: NumPy RandomState.
 
     Raises:
-        InputError: n is below one, or all volumes are zero.
+        InputError: all volumes are zero.
     """
-    if n < 1:
-        raise InputError(f"{n} filters cannot be learned; ask for at least one")
-    lengths = np.linalg.norm(white, axis=1)
-    usable = np.flatnonzero(lengths > 1e-6)
+    usable = np.flatnonzero(squares > 1e-12)
     if len(usable) == 0:
-        raise InputError("all volumes are constant; there is nothing to learn from")
+        raise InputError(
+            f"all {len(squares)} volumes are constant; there is nothing to learn from: "
+            "use recordings with events, or a larger patch"
+        )
     picked = rng.permutation(usable)[:n]
-    rows = white[picked] / lengths[picked, None]
-    if len(rows) < n:
-        more = rng.standard_normal((n - len(rows), white.shape[1])).astype(np.float32)
-        rows = np.concatenate([rows, more / np.linalg.norm(more, axis=1, keepdims=True)])
-    return np.asarray(rows, np.float32)
+    rows = rng.standard_normal((n, volumes.shape[1]))
+    rows *= _NOISE / np.linalg.norm(rows, axis=1, keepdims=True)
+    rows[: len(picked)] += volumes[picked] / np.sqrt(squares[picked, None])
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)

@@ -35,12 +35,12 @@ class Volumes:
     """A sample of local volumes.
 
     Attributes:
-        counts: `(n, d)` int16, clipped counts, bin-major.
+        counts: `(n, d)` clipped counts, bin-major; int8, or int16 where `max_count` asks for it.
         empty_share: share of the drawn places whose counts were all zero; they were drawn again.
         windows: how many windows were seen.
     """
 
-    counts: NDArray[np.int16]
+    counts: NDArray[np.signedinteger]
     empty_share: float
     windows: int
 
@@ -113,7 +113,7 @@ def sample_volumes(
     Raises:
         InputError: no volume with an event was found.
     """
-    kept = np.empty((n_volumes, geometry.entries), np.int16)
+    kept = np.empty((n_volumes, geometry.entries), np.min_scalar_type(-geometry.max_count))
     seen = drawn = empty = n_windows = 0
     for window in windows:
         if min(geometry.ring_shape(window.resolution)) < geometry.patch:

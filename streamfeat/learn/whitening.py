@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 from sklearn.base import BaseEstimator, TransformerMixin
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
+
+from streamfeat.errors import InputError
+from streamfeat.learn.chunks import checked_rows, chunks
 
 __all__ = ["VolumeWhitener"]
 
@@ -38,14 +41,34 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self.chunk_size = chunk_size
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
-        """Learn mean and whitening from `(n, d)` volumes in one pass; sums are float64."""
-        volumes = validate_data(self, X, ensure_min_samples=2)
+        """Learn mean and whitening from `(n, d)` volumes in one pass; sums are float64.
+
+        Args:
+            X: an array or a memory map of any integer or float dtype; not changed.
+            y: ignored.
+
+        Raises:
+            InputError: there are not more volumes than entries, a value is not finite, or every volume is
+                constant.
+        """
+        volumes = checked_rows(self, X)
         n, d = volumes.shape
+        if n <= d:
+            raise InputError(
+                f"n_samples = {n} is too few volumes for the covariance of their {d} entries; "
+                f"give more than {d}, or use a smaller patch or fewer bins"
+            )
         total, products = np.zeros(d), np.zeros((d, d))
-        for start in range(0, n, self.chunk_size):
-            normal = self._normalise(volumes[start : start + self.chunk_size])
+        for _, chunk in chunks(volumes, self.chunk_size):
+            normal = self._normalise(chunk)
             total += normal.sum(axis=0, dtype=np.float64)
             products += normal.T @ normal
+        # Of a constant volume nothing but rounding is left.
+        if np.trace(products) <= 1e-9 * n:
+            raise InputError(
+                f"all {n} volumes (n_features = {d}) are constant; there is no covariance to learn: "
+                "use recordings with events, or a larger patch"
+            )
         mean = total / n
         values, vectors = eigh(products / n - np.outer(mean, mean))
         scaled = vectors / np.sqrt(values.clip(min=0.0) + self.eps_zca)
@@ -57,11 +80,10 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     def transform(self, X: ArrayLike) -> NDArray[np.float32]:
         """Whiten `(n, d)` volumes; float32."""
         check_is_fitted(self)
-        volumes = validate_data(self, X, reset=False)
+        volumes = checked_rows(self, X, reset=False)
         white = np.empty(volumes.shape, np.float32)
-        for start in range(0, len(volumes), self.chunk_size):
-            stop = start + self.chunk_size
-            white[start:stop] = (self._normalise(volumes[start:stop]) - self.mean_) @ self.whitening_
+        for where, chunk in chunks(volumes, self.chunk_size):
+            white[where] = (self._normalise(chunk) - self.mean_) @ self.whitening_
         return white
 
     def __sklearn_tags__(self) -> Any:
@@ -70,8 +92,7 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         tags.transformer_tags.preserves_dtype = []
         return tags
 
-    def _normalise(self, volumes: NDArray[Any]) -> NDArray[np.float32]:
-        values = volumes.astype(np.float32)
-        values -= values.mean(axis=1, keepdims=True)
+    def _normalise(self, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
+        values: NDArray[np.float32] = chunk - chunk.mean(axis=1, keepdims=True)
         values /= np.sqrt(np.square(values).mean(axis=1, keepdims=True) + np.float32(self.eps))
         return values

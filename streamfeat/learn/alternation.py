@@ -1,0 +1,143 @@
+"""The loop that both formulations share: codes, matrix, codes, matrix, until little is gained.
+
+Lives here: `Alternation`, which starts, records, stops, is interrupted and goes on again.
+Not here: the half-steps themselves (`transform`, `dictionary`).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils import check_random_state
+
+from streamfeat.errors import InputError
+from streamfeat.learn.chunks import LazyVolumes, Rows, checked_rows, squared_lengths
+from streamfeat.learn.initial import random_directions
+from streamfeat.learn.omega import condition_number, mutual_coherence
+
+__all__ = ["Alternation", "Step"]
+
+
+class Step(NamedTuple):
+    """What one iteration found: the rows learned, and the objective after each of its half-steps."""
+
+    rows: NDArray[np.float32]
+    after_codes: float
+    after_rows: float
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Alternating minimisation over codes and the `(K, d)` rows of a transform or dictionary.
+
+    The rows are float32 from one iteration to the next, so that going on from saved ones is going on from
+    what there was.
+
+    Args:
+        max_iter: iterations at most, each of two half-steps.
+        tol: stop when an iteration lowers the objective by less than this share.
+        chunk_size: volumes whose codes are held as floats at a time.
+        warm_start: start from `components_` of the fit before.
+        random_state: seed of the initial rows.
+        progress: called with (iteration, objective) after each iteration.
+    """
+
+    max_iter: int = 20
+    tol: float = 1e-4
+    chunk_size: int = 2048
+    warm_start: bool = False
+    random_state: int | None = None
+    progress: Callable[[int, float], None] | None = None
+
+    def fit(self, X: ArrayLike | LazyVolumes, y: Any = None) -> Self:
+        """Learn from `(n, d)` whitened volumes: an array, a memory map, or `LazyVolumes`; not changed.
+
+        Ctrl-C ends learning, not the program: what the last whole iteration found is kept, and
+        `interrupted_` is true.
+
+        Raises:
+            InputError: a parameter is out of range, there are fewer volumes than rows to learn, a value is
+                not finite, or all volumes are constant.
+        """
+        volumes = checked_rows(self, X)
+        self._check(volumes.shape[0])
+        squares = squared_lengths(volumes, self.chunk_size)
+        rows = self._first_rows(volumes, squares)
+        objective: list[float] = []
+        condition: list[float] = []
+        coherence: list[float] = []
+        self.interrupted_ = False
+        try:
+            for step in islice(self._alternate(volumes, squares, rows), self.max_iter):
+                shown = condition_number(step.rows), mutual_coherence(step.rows)
+                rows = step.rows
+                objective += [step.after_codes, step.after_rows]
+                condition.append(shown[0])
+                coherence.append(shown[1])
+                if self.progress:
+                    self.progress(len(condition), step.after_rows)
+                gained = objective[-3] - objective[-1] if len(objective) > 2 else np.inf
+                if gained <= self.tol * abs(objective[-1]):
+                    break
+        except KeyboardInterrupt:
+            self.interrupted_ = True
+        self.components_ = rows
+        self.objective_ = np.array(objective)
+        self.condition_ = np.array(condition)
+        self.coherence_ = np.array(coherence)
+        self.n_iter_ = len(condition)
+        return self
+
+    def _check(self, n_volumes: int) -> None:
+        """Refuse parameters that cannot be used; subclasses check theirs as well."""
+        k = self._n_rows
+        if k < 1 or self.max_iter < 1 or self.chunk_size < 1:
+            raise InputError(
+                f"K is {k}, max_iter {self.max_iter} and chunk_size {self.chunk_size}; "
+                "each must be at least one"
+            )
+        if n_volumes < max(k, 2):
+            raise InputError(
+                f"n_samples = {n_volumes} is too few volumes to learn K = {k} from; "
+                f"give at least {max(k, 2)}, or lower K"
+            )
+
+    def _first_rows(self, volumes: Rows, squares: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Initial rows, or those of the fit before."""
+        shape = self._n_rows, volumes.shape[1]
+        if not (self.warm_start and hasattr(self, "components_")):
+            rng = check_random_state(self.random_state)
+            return random_directions(volumes, squares, self._n_rows, rng)
+        if self.components_.shape != shape:
+            raise InputError(
+                f"warm_start: components_ have shape {self.components_.shape}, {shape} is to be learned; "
+                "keep K and the volumes' length, or set warm_start=False"
+            )
+        return np.asarray(self.components_, np.float32)
+
+    @property
+    def _n_rows(self) -> int:
+        """`K`."""
+        raise NotImplementedError
+
+    def _alternate(
+        self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
+    ) -> Iterator[Step]:
+        """Iterate without end.
+
+        Args:
+            volumes: `(n, d)`.
+            squares: `(n,)` their squared lengths.
+            rows: `(K, d)` to start from.
+        """
+        raise NotImplementedError
+
+    def __sklearn_tags__(self) -> Any:
+        """Say that codes are float32 whatever goes in."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        return tags

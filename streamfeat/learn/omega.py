@@ -1,0 +1,103 @@
+"""What both formulations ask of a matrix beside the fit: `Omega`, and the two figures that show it.
+
+Lives here: the penalty with its gradient, condition number, mutual coherence. Not here: who minimises it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky
+
+from streamfeat.errors import InputError
+
+__all__ = ["Omega", "condition_number", "mutual_coherence"]
+
+
+@dataclass(frozen=True, slots=True)
+class Omega:
+    """The penalty on a transform or dictionary, for `M` the `(K, d)` filters or atoms as rows.
+
+    Kostadinov and Scaramuzza (ICPR 2020/21) print `Omega(D) = lambda2 |D|_F^2 - lambda3 |D D' - I|_F^2
+    - lambda4 log|det D D'|` for a dictionary `D = M'` of shape `(d, K)`. Here it is
+
+        conditioning/2 |M|_F^2 + coherence/4 |M'M - I|_F^2 - log_det log|det M'M|,
+
+    `lambda1` being part of the three weights. Two readings are needed, as in Kostadinov, Voloshynovskiy and
+    Ferdowsi (2018) and in Ravishankar and Bresler (2013, eq. 4):
+
+    - *Sign.* The coherence term is added: only then does its minimum mean low coherence.
+    - *Which Gram matrix.* `|M'M - I_d|_F^2`, as printed, is that of a tight frame; the inner products between
+      filters, which coherence is about, are those of `|M M' - I_K|_F^2`. Both are the sum of
+      `(sigma^2 - 1)^2` over the singular values of `M`, and one more for each dimension that is left, so they
+      differ by the constant `K - d`: one term serves a transform and a dictionary. The determinant has no
+      such luck: that of `M'M` is zero for `K < d` and that of `M M'` for `K > d`. The one that exists is
+      taken, which is the product of the squared singular values in both cases.
+
+    Args:
+        conditioning: weight of `|M|_F^2 / 2`, not negative.
+        coherence: weight of `|M'M - I|_F^2 / 4`, not negative.
+        log_det: weight of `-log|det M'M|`, not negative.
+
+    Raises:
+        InputError: a weight is negative or not finite.
+    """
+
+    conditioning: float = 0.0
+    coherence: float = 0.0
+    log_det: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the weights."""
+        for name in ("conditioning", "coherence", "log_det"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name} is {getattr(self, name)}, it must be finite and not negative")
+
+    def value(self, rows: NDArray[np.float64]) -> float:
+        """The penalty of `(K, d)` rows; infinite where the determinant is zero and has a weight."""
+        gram = _smaller_gram(rows)
+        squares = float(np.trace(gram))
+        value: float = 0.5 * self.conditioning * squares
+        value += 0.25 * self.coherence * (float(np.sum(gram * gram)) - 2 * squares + rows.shape[1])
+        if self.log_det:
+            try:
+                value -= 2 * self.log_det * float(np.log(np.diag(cholesky(gram))).sum())
+            except np.linalg.LinAlgError:
+                return float("inf")
+        return value
+
+    def gradient(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The gradient `(K, d)` of a finite `value`."""
+        gram = _smaller_gram(rows)
+        wide = rows if len(gram) == rows.shape[1] else rows.T
+        found = (self.conditioning - self.coherence) * wide
+        if self.coherence:
+            found += self.coherence * (wide @ gram)
+        if self.log_det:
+            found -= 2 * self.log_det * cho_solve((cholesky(gram, lower=True), True), wide.T).T
+        return np.asarray(found if wide is rows else found.T)
+
+
+def _smaller_gram(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`M'M` or `M M'`, whichever is smaller: their eigenvalues are the same but for zeros."""
+    return rows.T @ rows if rows.shape[0] >= rows.shape[1] else rows @ rows.T
+
+
+def condition_number(rows: NDArray[np.floating]) -> float:
+    """Largest singular value of `(K, d)` rows over the smallest.
+
+    Values below `1e-5` of the largest are left out: volumes have no mean, so that there is a direction which
+    a dictionary of them does not hold.
+    """
+    values = np.linalg.eigvalsh(_smaller_gram(rows.astype(np.float64)))
+    held = values[values > 1e-10 * max(values[-1], 1e-300)]
+    return float(np.sqrt(held[-1] / held[0])) if len(held) else float("inf")
+
+
+def mutual_coherence(rows: NDArray[np.floating]) -> float:
+    """The largest `|cos|` between two of `(K, d)` rows; rows of zeros are left out."""
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    unit = (rows / np.where(lengths > 1e-12, lengths, np.inf)).astype(np.float64)
+    cosines = np.abs(unit @ unit.T)
+    np.fill_diagonal(cosines, 0.0)
+    return float(cosines.max())
