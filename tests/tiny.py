@@ -6,8 +6,10 @@ from streamfeat.classifier import Classifier
 from streamfeat.encoder import Encoder
 from streamfeat.events import make_events
 from streamfeat.geometry import Geometry
+from streamfeat.learn.volumes import sample_volumes, windows_of
+from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, Packet
+from streamfeat.recording import Label, Packet, open_recording
 from streamfeat.simulate import Saccades, digit_samples
 
 GEOMETRY = Geometry(patch=4, stride=4, n_bins=2, bin_us=50_000, max_count=2)
@@ -54,6 +56,23 @@ def stream(times, seed=0, resolution=RESOLUTION):
     height, width = resolution
     n = len(t)
     return make_events(rng.integers(0, width, n), rng.integers(0, height, n), rng.integers(0, 2, n), t)
+
+
+def white_volumes(n=400, d=12, seed=0):
+    """Sparse combinations of a few directions, and noise: what learners learn from."""
+    rng = np.random.default_rng(seed)
+    codes = rng.standard_normal((n, 8)) * (rng.random((n, 8)) < 0.3)
+    x = codes @ rng.standard_normal((8, d)) + 0.2 * rng.standard_normal((n, d))
+    return x.astype(np.float32)
+
+
+def real_white_volumes(shared_data, n=1500):
+    """Whitened local volumes of a real recording, `(n, 72)`."""
+    geometry = Geometry(patch=6, stride=6, n_bins=2, bin_us=5_000, max_count=1)
+    with open_recording(shared_data / "samples/eventpacket_libcaer_cmp_346x260.mcap") as recording:
+        windows = windows_of(recording.items(), geometry)
+        counts = sample_volumes(windows, geometry, n, np.random.default_rng(0)).counts
+    return VolumeWhitener().fit_transform(counts)
 
 
 def steady(start_us, stop_us, n, seed=0, resolution=RESOLUTION):
