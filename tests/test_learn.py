@@ -7,6 +7,7 @@ import pytest
 import tiny
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
+from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.geometry import Geometry
@@ -189,30 +190,106 @@ def test_windows_end_where_the_resolution_changes():
 # --- all of it
 
 
-@pytest.mark.parametrize("formulation", ["direct", "inverse"])
-def test_learn_encoder(tmp_path, formulation):
+LEARN = {"n_filters": 7, "n_volumes": 200, "max_iter": 2, "seed": 4}
+
+
+@pytest.fixture
+def recording(tmp_path):
     path = tiny.write_items(tmp_path / "a.mcap", tiny.labelled_items(6))
-    told = []
     with open_recording(path) as recording:
-        model, again = (
-            learn_encoder(
-                [recording],
-                tiny.GEOMETRY,
-                formulation=formulation,
-                n_filters=7,
-                n_volumes=200,
-                max_iter=2,
-                seed=4,
-                report=lambda *step: told.append(step),
-            )
-            for _ in range(2)
+        yield recording
+
+
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_learn_encoder(recording, formulation):
+    told = []
+    model, again = (
+        learn_encoder(
+            [recording],
+            tiny.GEOMETRY,
+            formulation=formulation,
+            report=lambda *step: told.append(step),
+            **LEARN,
         )
+        for _ in range(2)
+    )
     assert (model.n_filters, model.formulation, model.geometry) == (7, formulation, tiny.GEOMETRY)
     assert model.fingerprint == again.fingerprint
     assert model.provenance["windows"] == 6
     assert model.provenance["volumes"] == 200
     assert model.provenance["recordings"] == ["a.mcap"]
+    assert model.provenance["interrupted"] is False
+    figures = [len(model.provenance[name]) for name in ("objective", "condition", "coherence")]
+    assert figures == [4, 2, 2]
     assert {step[0] for step in told} == {"reading windows", "whitening", "learning"}
+    share = f"{model.provenance['empty_share']:.1%} of places were empty"
+    assert share in next(step[3] for step in told if step[0] == "whitening")
+
+
+def interrupt_at(iteration):
+    """A report during which Ctrl-C comes."""
+
+    def report(step, done, total, remark):
+        if (step, done) == ("learning", iteration):
+            raise KeyboardInterrupt
+
+    return report
+
+
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_an_interrupted_encoder_is_one_to_go_on_from(recording, tmp_path, formulation):
+    make = LEARN | {"formulation": formulation, "max_iter": 5}
+    whole = learn_encoder([recording], tiny.GEOMETRY, **make)
+    part = learn_encoder([recording], tiny.GEOMETRY, **make, report=interrupt_at(2))
+    assert (part.provenance["interrupted"], part.provenance["iterations"]) == (True, 2)
+    part.save(tmp_path / "part")
+    part = Encoder.load(tmp_path / "part")
+    rest = learn_encoder([recording], tiny.GEOMETRY, **make | {"max_iter": 3}, resume=part)
+    assert (rest.provenance["interrupted"], rest.provenance["iterations"]) == (False, 5)
+    assert [len(rest.provenance[name]) for name in ("objective", "condition", "coherence")] == [10, 5, 5]
+    if formulation == "direct":
+        assert rest.fingerprint == whole.fingerprint
+        assert rest.provenance == whole.provenance
+    else:
+        # Codes start from zero again, and are the same within the duality gap.
+        assert rest.provenance["objective"][-1] == pytest.approx(whole.provenance["objective"][-1], rel=0.01)
+
+
+def test_an_interruption_before_anything_was_learned_gives_no_encoder(recording):
+    def report(step, done, total, remark):
+        if step == "reading windows":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        learn_encoder([recording], tiny.GEOMETRY, **LEARN, report=report)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"geometry": Geometry(4, 2, 2, 50_000, 1, 2)}, r"has geometry .*stride=4.* not .*stride=2"),
+        ({"formulation": "inverse"}, "has formulation direct, not inverse"),
+        ({"encoding": "soft"}, "has encoding split, not soft"),
+        ({"threshold": 0.7}, "has threshold 0.5, not 0.7"),
+        ({"n_filters": 8}, "has filters 7, not 8"),
+        ({"n_volumes": 100}, r"learned from other volumes \(200 of a.mcap, seed 4\)"),
+        ({"seed": 5}, "learned from other volumes"),
+    ],
+)
+def test_going_on_from_something_else_is_refused(recording, change, reason):
+    model = learn_encoder([recording], tiny.GEOMETRY, **LEARN)
+    with pytest.raises(InputError, match=reason):
+        learn_encoder([recording], **{"geometry": tiny.GEOMETRY} | LEARN | change, resume=model)
+
+
+def test_going_on_from_other_recordings_or_a_model_without_history_is_refused(recording, tmp_path):
+    model = learn_encoder([recording], tiny.GEOMETRY, **LEARN)
+    other = tiny.write_items(tmp_path / "a2.mcap", tiny.labelled_items(5))
+    with open_recording(other) as opened, pytest.raises(InputError, match="other volumes"):
+        learn_encoder([opened], tiny.GEOMETRY, **LEARN, resume=model)
+    bare = tiny.encoder(k=7)
+    with pytest.raises(InputError, match="does not say how it was learned"):
+        learn_encoder([recording], tiny.GEOMETRY, **LEARN, threshold=0.3, resume=bare)
 
 
 @pytest.mark.parametrize(
@@ -221,6 +298,8 @@ def test_learn_encoder(tmp_path, formulation):
         ({"formulation": "sideways"}, "formulation is 'sideways'"),
         ({"encoding": "loud"}, "encoding is 'loud'"),
         ({"n_volumes": 1}, "at least two volumes"),
+        ({"n_volumes": 32}, "32 volumes are too few .* a covariance of 32 entries; learn from at least 33"),
+        ({"n_filters": 300}, "200 volumes are too few for 300 filters .* at least 300"),
         ({"max_iter": 0}, "one iteration"),
         ({"seed": -1}, "seed"),
         ({"seed": 2**40}, "seed"),
@@ -228,10 +307,16 @@ def test_learn_encoder(tmp_path, formulation):
         ({"n_filters": 0}, "one filter"),
     ],
 )
-def test_bad_parameters_are_refused_before_any_work(tmp_path, change, reason):
-    path = tiny.write_items(tmp_path / "a.mcap", tiny.labelled_items(2))
-    with open_recording(path) as recording, pytest.raises(InputError, match=reason):
-        learn_encoder([recording], tiny.GEOMETRY, **({"n_filters": 5, "n_volumes": 50} | change))
+def test_bad_parameters_are_refused_before_any_work(recording, change, reason):
+    with pytest.raises(InputError, match=reason):
+        learn_encoder([recording], tiny.GEOMETRY, **LEARN | change, report=interrupt_at(1))
+
+
+def test_a_recording_of_too_few_volumes_is_refused(tmp_path):
+    path = tiny.write_items(tmp_path / "b.mcap", tiny.labelled_items(1, events=3))
+    with open_recording(path) as recording, pytest.raises(InputError, match="too few volumes") as refusal:
+        learn_encoder([recording], tiny.GEOMETRY, **LEARN | {"n_volumes": 1000, "n_filters": 900})
+    assert "\n" not in str(refusal.value)
 
 
 def test_bin_length(tmp_path):
