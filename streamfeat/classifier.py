@@ -195,8 +195,14 @@ def train_classifier(
         provenance: JSON values kept with the classifier; scores are added.
 
     Raises:
-        InputError: fewer than two classes, or a class with fewer samples than folds.
+        InputError: labels are missing, fewer than two classes, or a class with fewer samples than folds.
     """
+    missing = [i for i, label in enumerate(labels) if not (isinstance(label, str) and label)]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(labels)} training samples have no label, the first is sample "
+            f"{missing[0]}; label them or leave them out"
+        )
     names, counts = np.unique(np.asarray(labels), return_counts=True)
     if len(names) < 2:
         raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")

@@ -261,6 +261,9 @@ def test_train_refusals():
     for folds in (1, 0, -3):
         with pytest.raises(InputError, match="folds"):
             train_classifier(features, labels, MODEL, folds=folds)
+    for missing in ("", None, float("nan")):
+        with pytest.raises(InputError, match="2 of 10 training samples have no label, the first is sample 4"):
+            train_classifier(features, [*labels[:4], missing, missing, *labels[6:]], MODEL)
 
 
 # --- learning online

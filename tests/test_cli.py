@@ -1,5 +1,6 @@
 """The command line, end to end: what it prints, writes and refuses."""
 
+import itertools
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from streamfeat.classifier import Classifier
 from streamfeat.encoder import Encoder
 from streamfeat.events import make_events
 from streamfeat.features import sample_end
+from streamfeat.learn import alternation, volumes
 from streamfeat.messages import EventPacket
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label, open_recording
@@ -132,6 +134,24 @@ def test_from_a_data_set_to_predictions(run, tmp_path):
     said = run("replay", recording, "-m", tmp_path / "model", "-c", tmp_path / "clf", "--json").json
     assert (said["samples"], said["events"], said["lost"]) == (8, 1200, 0)
     assert said["accuracy"] == said["correct"] / 8
+
+
+def test_learning_goes_on_from_a_model(run, home, tmp_path):
+    model, whole = tmp_path / "model", tmp_path / "whole"
+    learn = ["learn", home / "train.mcap", *LEARN]
+    assert run(*learn, "-o", whole, "--iterations", "4").status == 0
+    assert run(*learn, "-o", model).status == 0
+    assert run(*learn, "-o", model).status == 2
+    said = run(*learn, "-o", model, "--resume", model, "--json").json
+    assert said["iterations"] == 4
+    assert Encoder.load(model).fingerprint == Encoder.load(whole).fingerprint
+
+
+def test_the_other_log_determinant_is_remarked_upon(run, home, tmp_path):
+    learn = ["learn", home / "train.mcap", "-o", tmp_path / "model", *LEARN, "--overwrite"]
+    assert "that of A XX' A': 6 filters are fewer than 72 entries" in run(*learn).out
+    assert "XX'" not in run(*learn, "--filters", "72").out
+    assert "XX'" not in run(*learn, "--formulation", "inverse").out
 
 
 @pytest.mark.parametrize("formulation", ["direct", "inverse"])
@@ -307,6 +327,7 @@ def bad(home, tmp_path_factory):
         [Label(0, 1000, "cat"), tiny.packet(tiny.steady(0, 1000, 50, resolution=(5, 5)), (5, 5))],
     )
     tiny.write_items(bad / "unlabelled.mcap", [tiny.packet(tiny.steady(0, 90_000, 900))])
+    tiny.write_items(bad / "partly_labelled.mcap", tiny.labelled_items(6, names=("cat", "", "dog")))
     tiny.write_items(bad / "one_class.mcap", tiny.labelled_items(4, names=("cat",)))
     tiny.write_items(bad / "few.mcap", tiny.labelled_items(4, names=("cat", "dog", "cat", "cat")))
     items = [
@@ -377,8 +398,16 @@ REFUSALS = {
     "too few volumes": ([*NEW, "--volumes", "1"], "two volumes"),
     "too few volumes found": (
         ["learn", "{bad}/silent.mcap", "-o", "{bad}/new", "--patch", "8"],
-        "nothing to learn from",
+        "too few volumes for the covariance of their 192 entries; give more than 192",
     ),
+    "too few volumes for K": ([*NEW, "--filters", "301"], "too few for 301 filters"),
+    "too few volumes for d": (
+        [*NEW, "--volumes", "72"],
+        "a covariance of 72 entries; learn from at least 73",
+    ),
+    "resume nothing": ([*NEW, "--resume", "{bad}/missing"], "no such file"),
+    "resume with another K": ([*NEW, "--resume", "{home}/direct", "--filters", "7"], "filters 6, not 7"),
+    "resume with another seed": ([*NEW, "--resume", "{home}/direct", "--seed", "9"], "from other volumes"),
     "nothing but held out": (["learn", "{bad}/held_out.mcap", "-o", "{bad}/new"], "no local volume"),
     "too much memory": ([*NEW, "--volumes", str(10**15)], "memory"),
     "payload": (["convert", "{bad}/data", "{bad}/new", "--encoding", "morse"], "morse"),
@@ -387,6 +416,14 @@ REFUSALS = {
     "gap": (["convert", "{bad}/data", "{bad}/new", "--gap-ms", "nan"], "gap"),
     "no gap": (["convert", "{bad}/data", "{bad}/new", "--gap-ms", "0"], "gap"),
     "no labels": (["train", "{bad}/unlabelled.mcap", *TRAIN], "no labelled samples"),
+    "no labels in one of two": (
+        ["train", "{home}/train.mcap", "{bad}/unlabelled.mcap", *TRAIN],
+        "unlabelled.mcap: has no labelled samples",
+    ),
+    "labels missing in part": (
+        ["train", "{bad}/partly_labelled.mcap", *TRAIN],
+        "2 of 6 training samples have no label",
+    ),
     "one class": (["train", "{bad}/one_class.mcap", *TRAIN], "1 label"),
     "class too small": (["train", "{bad}/few.mcap", *TRAIN], "'dog' has 1 training samples"),
     "all held out": (["train", "{bad}/held_out.mcap", *TRAIN], "held-out"),
@@ -475,3 +512,42 @@ def test_an_interrupted_replay_keeps_what_it_read(home, tmp_path):
         counts = make_reader(file).get_summary().statistics.message_count
     assert counts > 0
     assert list(tmp_path.iterdir()) == [target]
+
+
+def send_ctrl_c(monkeypatch, module, name, call):
+    """Let Ctrl-C come when a function of a module is called for the so-manieth time."""
+    real, calls = getattr(module, name), itertools.count(1)
+
+    def called(*arguments):
+        if next(calls) == call:
+            signal.raise_signal(signal.SIGINT)
+        return real(*arguments)
+
+    monkeypatch.setattr(module, name, called)
+
+
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_interrupted_learning_writes_the_model_so_far(run, home, tmp_path, monkeypatch, formulation):
+    model = tmp_path / "model"
+    learn = ["learn", home / "train.mcap", "-o", model, *LEARN, "--formulation", formulation]
+    learn += ["--iterations", "50", "--json"]
+    with monkeypatch.context() as during:
+        send_ctrl_c(during, alternation, "condition_number", 3)
+        result = run(*learn)
+    assert result.status == 130
+    assert f"interrupted after 2 iterations; the same command with --resume {model}" in result.err
+    assert result.json["iterations"] == 2
+    assert Encoder.load(model).provenance["interrupted"] is True
+    said = run(*learn, "--resume", model)
+    assert said.status == 0
+    assert said.json["iterations"] > 2
+
+
+def test_learning_interrupted_before_its_first_iteration_writes_nothing(run, home, tmp_path, monkeypatch):
+    for module, name in ((alternation, "condition_number"), (volumes, "count_window")):
+        with monkeypatch.context() as during:
+            send_ctrl_c(during, module, name, 1)
+            result = run("learn", home / "train.mcap", "-o", tmp_path / "model", *LEARN)
+        assert (result.status, result.out) == (130, "")
+        assert result.err.splitlines() == ["interrupted before an iteration was done; nothing was written"]
+        assert list(tmp_path.iterdir()) == []

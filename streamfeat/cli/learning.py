@@ -103,7 +103,7 @@ def learn(
     }
     entries = encoder.geometry.entries
     if formulation == "direct" and filters < entries:
-        result["log_determinant"] = f"that of A A', since {filters} filters are fewer than {entries} entries"
+        result["log_determinant"] = f"that of A XX' A': {filters} filters are fewer than {entries} entries"
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
         print_losses(rec.losses)
@@ -142,8 +142,9 @@ def train(
     with contextlib.ExitStack() as files, progress_bars() as report:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
         total = sum(len(rec.labels) for rec in opened)
-        if total == 0:
-            raise InputError(f"{recordings[0]}: has no labelled samples; `streamfeat convert` writes labels")
+        for rec in opened:
+            if not rec.labels:
+                raise InputError(f"{rec.path}: has no labelled samples; `streamfeat convert` writes labels")
         for rec in opened:
             for label, features in encode_samples(encoder, rec.samples()):
                 rows.append((label.split in HELD_OUT_SPLITS, label.label, features))

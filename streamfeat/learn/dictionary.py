@@ -122,6 +122,7 @@ class DictionaryLearner(Alternation):
             raise InputError(f"threshold is {self.threshold}, it must be finite and above zero")
         if not 0 < self.gap < 1:
             raise InputError(f"gap is {self.gap}, it must be between zero and one")
+        Omega(coherence=self.coherence)  # refuses a weight that cannot be used
         super()._check(n_volumes)
 
     def _alternate(

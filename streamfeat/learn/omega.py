@@ -31,13 +31,15 @@ class Omega:
       filters, which coherence is about, are those of `|M M' - I_K|_F^2`. Both are the sum of
       `(sigma^2 - 1)^2` over the singular values of `M`, and one more for each dimension that is left, so they
       differ by the constant `K - d`: one term serves a transform and a dictionary. The determinant has no
-      such luck: that of `M'M` is zero for `K < d` and that of `M M'` for `K > d`. The one that exists is
-      taken, which is the product of the squared singular values in both cases.
+      such luck: that of `M'M` exists for `K >= d` only. For `K < d` it is that of `M S M'`, where `S` is the
+      second moment of the volumes. (For `K >= d` that would be the same but for the constant `log|det S|`.
+      `M M'` alone rewards filters along the directions in which volumes vary least, which is noise: with
+      K = 200 on N-CARS it cost three points of accuracy, 0.90 to 0.87.)
 
     Args:
         conditioning: weight of `|M|_F^2 / 2`, not negative.
         coherence: weight of `|M'M - I|_F^2 / 4`, not negative.
-        log_det: weight of `-log|det M'M|`, not negative.
+        log_det: weight of `-log|det M'M|`, or `-log|det M S M'|` for `K < d`, not negative.
 
     Raises:
         InputError: a weight is negative or not finite.
@@ -53,29 +55,41 @@ class Omega:
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} is {getattr(self, name)}, it must be finite and not negative")
 
-    def value(self, rows: NDArray[np.float64]) -> float:
-        """The penalty of `(K, d)` rows; infinite where the determinant is zero and has a weight."""
+    def value(self, rows: NDArray[np.float64], moment: NDArray[np.float64] | None = None) -> float:
+        """The penalty of `(K, d)` rows; infinite where the determinant is zero and has a weight.
+
+        Args:
+            rows: `M`.
+            moment: `S`, `(d, d)`, of use for the determinant of `K < d` rows only; I if not given.
+        """
         gram = _smaller_gram(rows)
         squares = float(np.trace(gram))
         value: float = 0.5 * self.conditioning * squares
         value += 0.25 * self.coherence * (float(np.sum(gram * gram)) - 2 * squares + rows.shape[1])
         if self.log_det:
+            tall = len(gram) == rows.shape[1]
+            weighted = gram if tall or moment is None else rows @ moment @ rows.T
             try:
-                value -= 2 * self.log_det * float(np.log(np.diag(cholesky(gram))).sum())
+                value -= 2 * self.log_det * float(np.log(np.diag(cholesky(weighted))).sum())
             except np.linalg.LinAlgError:
                 return float("inf")
         return value
 
-    def gradient(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(
+        self, rows: NDArray[np.float64], moment: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """The gradient `(K, d)` of a finite `value`."""
         gram = _smaller_gram(rows)
-        wide = rows if len(gram) == rows.shape[1] else rows.T
-        found = (self.conditioning - self.coherence) * wide
+        tall = len(gram) == rows.shape[1]
+        found = (self.conditioning - self.coherence) * rows
         if self.coherence:
-            found += self.coherence * (wide @ gram)
-        if self.log_det:
-            found -= 2 * self.log_det * cho_solve((cholesky(gram, lower=True), True), wide.T).T
-        return np.asarray(found if wide is rows else found.T)
+            found += self.coherence * (rows @ gram if tall else gram @ rows)
+        if self.log_det and tall:
+            found -= 2 * self.log_det * cho_solve((cholesky(gram, lower=True), True), rows.T).T
+        elif self.log_det:
+            turned = rows if moment is None else rows @ moment
+            found -= 2 * self.log_det * cho_solve((cholesky(turned @ rows.T, lower=True), True), turned)
+        return found
 
 
 def _smaller_gram(rows: NDArray[np.float64]) -> NDArray[np.float64]:

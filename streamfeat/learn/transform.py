@@ -27,16 +27,16 @@ each costs two to three products of `(K, d)` with `(d, d)`, little beside a pass
 class _Quadratic(NamedTuple):
     """What is minimised over `A` for fixed codes: `1/2 tr(A S A') - tr(A C') + Omega(A)`."""
 
-    second_moment: NDArray[np.float64]  # S = X X' / n, (d, d)
+    moment: NDArray[np.float64]  # S + conditioning I, S = X X' / n, (d, d)
     cross: NDArray[np.float64]  # C = L X' / n, (K, d)
-    omega: Omega
+    penalty: Omega  # but for the conditioning
 
     def value(self, A: NDArray[np.float64]) -> float:
-        fit = 0.5 * np.sum((A @ self.second_moment) * A) - np.sum(A * self.cross)
-        return float(fit) + self.omega.value(A)
+        fit = 0.5 * np.sum((A @ self.moment) * A) - np.sum(A * self.cross)
+        return float(fit) + self.penalty.value(A, self.moment)
 
     def gradient(self, A: NDArray[np.float64]) -> NDArray[np.float64]:
-        return A @ self.second_moment - self.cross + self.omega.gradient(A)
+        return A @ self.moment - self.cross + self.penalty.gradient(A, self.moment)
 
 
 @dataclass(eq=False, repr=False)
@@ -48,13 +48,12 @@ class TransformLearner(Alternation):
 
     Codes are exact: a soft threshold. The transform is updated through the singular value decomposition of
     `L X' S^-T` with `X X' + conditioning I = S S'` (Ravishankar and Bresler 2013, section IV-B, generalised
-    to `K != d`), each singular value the root of a scalar equation: exact for `K >= d` without the coherence
-    term. With it the singular vectors are kept and the equation becomes a quartic (Kostadinov et al. 2018,
-    approximate closed form). That candidate alone can stall, in two ways: the best singular vectors are those
-    of `L X' S^-T` only where the penalty is a function of `A S` alone, which coherence, and the determinant
-    for `K < d`, are not; and it takes no account of where the transform was. So it is taken only if it is
-    better than the transform before, and a few gradient steps follow, each shortened until the objective
-    falls (Armijo): it never rises, and stays only where the gradient is zero.
+    to `K != d`), each singular value the root of a scalar equation: exact without the coherence term. With it
+    the singular vectors are kept and the equation becomes a quartic (Kostadinov et al. 2018, approximate
+    closed form). That candidate alone stalls: its singular vectors are the best only where the penalty is a
+    function of `A S` alone, and coherence is one of `A`, so that it may be worse than the transform before
+    however far one goes towards it. It is taken only if it is better, and a few gradient steps follow, each
+    shortened until the objective falls (Armijo): it never rises, and stays only where the gradient is zero.
 
     State: `2 d^2 + 5 K d` float64 and, for each of `chunk_size` volumes, `2 K + d` float32, however many
     volumes there are; only the sums `X X'` and `L X'` over chunks are kept. (Volumes take `8 n` bytes more,
@@ -65,7 +64,7 @@ class TransformLearner(Alternation):
         threshold: `lambda0`, not negative.
         conditioning: weight of `|A|_F^2 / 2`.
         coherence: weight of `|A'A - I|_F^2 / 4`.
-        log_det: weight of `-log|det A'A|`, or of `-log|det A A'|` for `K < d`.
+        log_det: weight of `-log|det A'A|`, or of `-log|det A X X' A'|` for `K < d`.
         max_iter: iterations at most, each of two half-steps.
         tol: stop when an iteration lowers the objective by less than this share.
         chunk_size: volumes whose codes are held at a time.
@@ -106,19 +105,21 @@ class TransformLearner(Alternation):
     def _check(self, n_volumes: int) -> None:
         if not 0 <= self.threshold < np.inf:
             raise InputError(f"threshold is {self.threshold}, it must be finite and not negative")
+        Omega(self.conditioning, self.coherence, self.log_det)  # refuses weights that cannot be used
         super()._check(n_volumes)
 
     def _alternate(
         self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
     ) -> Iterator[Step]:
-        omega = Omega(self.conditioning, self.coherence, self.log_det)
-        second_moment = np.zeros((volumes.shape[1],) * 2)
+        d = volumes.shape[1]
+        # Conditioning is part of the quadratic form; never quite zero, so that the form has an inverse.
+        moment = max(self.conditioning, 1e-6) * np.eye(d)
         for _, chunk in chunks(volumes, self.chunk_size):
-            second_moment += chunk.T @ chunk
-        second_moment /= volumes.shape[0]
+            moment += (chunk.T @ chunk) / volumes.shape[0]
+        penalty = Omega(coherence=self.coherence, log_det=self.log_det)
         while True:
             cross, constant = self._code(volumes, rows)
-            problem = _Quadratic(second_moment, cross, omega)
+            problem = _Quadratic(moment, cross, penalty)
             before = problem.value(rows.astype(np.float64))
             found = _update(problem, rows.astype(np.float64), before).astype(np.float32)
             after = problem.value(found.astype(np.float64))
@@ -153,16 +154,14 @@ def _update(problem: _Quadratic, A: NDArray[np.float64], before: float) -> NDArr
 
 def _closed_form(problem: _Quadratic) -> NDArray[np.float64]:
     """Minimise over the singular values of `B = A S`, in the singular basis of `L X' S^-T`."""
-    omega = problem.omega
-    d = problem.cross.shape[1]
-    ridge = max(omega.conditioning, 1e-6) * np.eye(d)
-    factor = cholesky(problem.second_moment + ridge, lower=True)
+    penalty = problem.penalty
+    factor = cholesky(problem.moment, lower=True)
     target = solve_triangular(factor, problem.cross.T, lower=True)
     right, sigma, left = svd(target, full_matrices=False)
     back = solve_triangular(factor, right, lower=True, trans="T")
     # A direction of B of length one is as long as this in A.
     shrink = np.square(back).sum(axis=0)
-    gamma = _positive_root(sigma, omega.coherence, shrink, omega.log_det)
+    gamma = _positive_root(sigma, penalty.coherence, shrink, penalty.log_det)
     return np.asarray(((back * gamma) @ left).T)
 
 
@@ -186,9 +185,8 @@ def _positive_root(
 
 def _descend(problem: _Quadratic, A: NDArray[np.float64], value: float) -> NDArray[np.float64]:
     """A few gradient steps in the metric of the quadratic part; each lowers the objective or is not taken."""
-    omega = problem.omega
-    stiffness = omega.conditioning + 2.0 * omega.coherence + omega.log_det + 1e-6
-    metric = cholesky(problem.second_moment + stiffness * np.eye(A.shape[1]), lower=True)
+    stiffness = 2.0 * problem.penalty.coherence + problem.penalty.log_det
+    metric = cholesky(problem.moment + stiffness * np.eye(A.shape[1]), lower=True)
     length = 1.0
     for _ in range(GRADIENT_STEPS):
         gradient = problem.gradient(A)

@@ -1,0 +1,67 @@
+"""Features as a step of scikit-learn: cloned, searched over, cached, and refused what is not a sample."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.utils.validation import check_is_fitted
+
+import streamfeat as sf
+from streamfeat.classifier import normalise_features
+from streamfeat.svm import LinearSVM
+
+RECORDINGS = Path(__file__).parents[1] / "recordings"
+
+
+@pytest.fixture(scope="module")
+def digits():
+    """Labelled samples of the recordings that come with the project, and the model learned from them."""
+    samples = {}
+    for split in ("train", "test"):
+        with sf.open_recording(RECORDINGS / f"digits_{split}.mcap") as recording:
+            samples[split] = list(recording.samples())
+    return samples["train"], samples["test"], sf.Encoder.load(RECORDINGS / "digits.safetensors")
+
+
+def test_a_grid_search_over_a_pipeline(digits):
+    train, test, encoder = digits
+    pipeline = Pipeline(
+        [
+            ("features", sf.EventFeatures(encoder)),
+            ("normalise", FunctionTransformer(normalise_features)),
+            ("scale", StandardScaler()),
+            ("svm", LinearSVM()),
+        ]
+    )
+    search = GridSearchCV(pipeline, {"svm__C": [1e-7, 1e-3]}, cv=2)
+    search.fit(train, [sample.label.label for sample in train])
+    assert search.best_params_["svm__C"] == 1e-3
+    assert search.score(test, [sample.label.label for sample in test]) > 0.85
+
+
+def test_encoders_are_searched_over(digits):
+    train, _, encoder = digits
+    pipeline = Pipeline(
+        [("features", sf.EventFeatures(encoder)), ("scale", StandardScaler()), ("svm", LinearSVM(C=1e-3))]
+    )
+    random = tiny.encoder(k=2, geometry=encoder.geometry)
+    search = GridSearchCV(pipeline, {"features__encoder": [random, encoder]}, cv=2)
+    search.fit(train[:100], [sample.label.label for sample in train[:100]])
+    assert search.best_params_["features__encoder"].fingerprint == encoder.fingerprint
+
+
+def test_features_are_a_scikit_learn_transformer(digits):
+    train, _, encoder = digits
+    step = sf.EventFeatures(encoder, threads=1)
+    check_is_fitted(step)
+    copied = clone(step)
+    assert (copied.threads, copied.encoder.fingerprint) == (1, encoder.fingerprint)
+    few = step.fit_transform(train[:5])
+    assert few.dtype == np.float32
+    assert few.shape == (5, encoder.n_features)
+    assert np.array_equal(few, copied.transform(iter(train[:5])))
