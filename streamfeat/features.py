@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 
 from streamfeat.encoder import Encoder
+from streamfeat.errors import InputError
 from streamfeat.recording import Label, Sample
 
 __all__ = ["EventFeatures", "encode_samples", "sample_end"]
@@ -75,10 +76,24 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def transform(self, X: Iterable[Sample]) -> NDArray[np.float32]:
-        """Features `(n, n_features)` float32 of `n` samples, such as `list(recording.samples())`."""
-        rows = [features for _, features in encode_samples(self.encoder, X, threads=self.threads)]
+        """Features `(n, n_features)` float32 of `n` samples, such as `list(recording.samples())`.
+
+        Raises:
+            InputError: one of them is not a sample.
+        """
+        rows = [features for _, features in encode_samples(self.encoder, _checked(X), threads=self.threads)]
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)
 
     def __sklearn_is_fitted__(self) -> bool:
         """Say that there is nothing to fit."""
         return True
+
+
+def _checked(samples: Iterable[Any]) -> Iterator[Sample]:
+    for i, sample in enumerate(samples):
+        if not isinstance(sample, Sample):
+            raise InputError(
+                f"sample {i} is of type {type(sample).__name__}; "
+                "give labelled samples, such as list(recording.samples())"
+            )
+        yield sample

@@ -13,6 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 import streamfeat as sf
 from streamfeat.classifier import normalise_features
+from streamfeat.errors import InputError
 from streamfeat.svm import LinearSVM
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
@@ -65,3 +66,9 @@ def test_features_are_a_scikit_learn_transformer(digits):
     assert few.dtype == np.float32
     assert few.shape == (5, encoder.n_features)
     assert np.array_equal(few, copied.transform(iter(train[:5])))
+
+
+def test_what_is_not_a_sample_is_refused(digits):
+    _, test, encoder = digits
+    with pytest.raises(InputError, match="sample 1 is of type ndarray; give labelled samples"):
+        sf.EventFeatures(encoder).transform([test[0], test[1].events])
