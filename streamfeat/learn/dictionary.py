@@ -68,8 +68,8 @@ class DictionaryLearner(Alternation):
     No half-step raises the objective. After an iteration an atom that no volume uses becomes the volume that
     is represented worst, which does not touch fit and codes, but may raise the coherence term.
 
-    State: at most `4 K^2 + 5 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, 16 bytes for each
-    volume and 8 for each code that is not zero, from which the next lasso starts.
+    State: at most `4 K^2 + 5 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, for each
+    volume 16 bytes and for each code that is not zero 8, from which the next lasso starts.
 
     Args:
         n_atoms: `K`.

@@ -55,8 +55,8 @@ class TransformLearner(Alternation):
     however far one goes towards it. It is taken only if it is better, and a few gradient steps follow, each
     shortened until the objective falls (Armijo): it never rises, and stays only where the gradient is zero.
 
-    State: at most `3 d^2 + 10 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, and 8 bytes for
-    each volume, its squared length: of the volumes only the sums `X X'` and `L X'` over chunks are kept.
+    State: at most `3 d^2 + 10 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, and for each
+    volume 8 bytes, its squared length: of the volumes only the sums `X X'` and `L X'` over chunks are kept.
 
     Args:
         n_filters: `K`.
