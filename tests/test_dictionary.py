@@ -149,6 +149,10 @@ def test_unused_atoms_become_what_is_represented_worst():
 def test_atoms_without_use_are_replaced_in_learning():
     white = tiny.white_volumes(300)
     learner = DictionaryLearner(15, threshold=0.3, max_iter=1, random_state=0).fit(white)
+    assert learner.unused_ == 0
+    learner.components_[4:] = learner.components_[4]
+    learner.set_params(warm_start=True, max_iter=1).fit(white)
+    assert learner.unused_ >= 10
     learner.components_[4:] = learner.components_[4]
     learner.set_params(warm_start=True, max_iter=8, tol=0.0).fit(white)
     assert learner.replaced_ >= 10

@@ -192,6 +192,7 @@ def test_condition_and_coherence_are_reported():
     firm = TransformLearner(20, coherence=1, log_det=1, **make).fit(white)
     assert firm.condition_[-1] < bare.condition_[-1] / 2
     for learner in (bare, firm):
+        assert learner.unused_ == 0
         rows = learner.components_.astype(np.float64)
         assert learner.condition_[-1] == pytest.approx(np.linalg.cond(rows), rel=1e-4)
         unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -215,6 +216,7 @@ def test_a_threshold_above_all_codes_is_survived(omega):
     learner = TransformLearner(D + 3, threshold=1e6, max_iter=3, random_state=0, **omega)
     learner.fit(tiny.white_volumes())
     assert np.isfinite(learner.components_).all()
+    assert learner.unused_ == D + 3
     assert not learner.transform(tiny.white_volumes()).any()
 
 

@@ -99,6 +99,7 @@ def learn(
         "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
         "condition": encoder.provenance["condition"][-1],
         "coherence": encoder.provenance["coherence"][-1],
+        "unused": encoder.provenance["unused"],
         "bytes": model.stat().st_size,
     }
     entries = encoder.geometry.entries

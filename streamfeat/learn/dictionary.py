@@ -89,6 +89,7 @@ class DictionaryLearner(Alternation):
         condition_: `(n_iter_,)` ratio of the largest to the smallest singular value of `D`.
         coherence_: `(n_iter_,)` largest `|cos|` between two atoms.
         replaced_: atoms replaced in this fit.
+        unused_: atoms that no volume's code used in the last iteration.
         n_iter_: iterations done in this fit.
         interrupted_: whether Ctrl-C ended it.
     """
@@ -141,8 +142,9 @@ class DictionaryLearner(Alternation):
             scale = _sweep(atoms, sums, self.threshold, self.coherence).astype(np.float32)
             after = energy + sums.objective(atoms, self.threshold) + omega.value(atoms)
             rows = atoms.astype(np.float32)
-            yield Step(rows, before, after)
             unused = np.flatnonzero(np.diag(sums.gram) <= _UNUSED)
+            self.unused_ = len(unused)
+            yield Step(rows, before, after)
             if len(unused):
                 rows = rows.copy()
                 self.replaced_ += _replace(rows, unused, volumes, squares, errors)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from streamfeat.encoder import Encoder, Encoding, Formulation
 from streamfeat.errors import InputError
 from streamfeat.geometry import Geometry
-from streamfeat.learn.alternation import Alternation
 from streamfeat.learn.chunks import LazyVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
 from streamfeat.learn.transform import TransformLearner
@@ -120,7 +119,7 @@ def learn_encoder(
     def learned(iteration: int, objective: float) -> None:
         report("learning", iteration, max_iter, f"objective {objective:.4f}")
 
-    learner: Alternation
+    learner: TransformLearner | DictionaryLearner
     if formulation == "direct":
         learner = TransformLearner(n_filters, threshold=penalty)
     else:
@@ -143,6 +142,7 @@ def learn_encoder(
         "objective": _rounded(learner.objective_),
         "condition": _rounded(learner.condition_),
         "coherence": _rounded(learner.coherence_),
+        "unused": learner.unused_,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }
     if resume:

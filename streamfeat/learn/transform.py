@@ -76,6 +76,9 @@ class TransformLearner(Alternation):
         objective_: `(2 n_iter_,)` the objective after each half-step (codes, transform) of this fit.
         condition_: `(n_iter_,)` ratio of the largest to the smallest singular value of `A`.
         coherence_: `(n_iter_,)` largest `|cos|` between two filters.
+        unused_: filters that no volume's code used in the last iteration. Many of them, as may be with
+            `K > d`, say that the threshold is too high or `log_det` too low: no term of `Omega` asks for more
+            than `d` filters.
         n_iter_: iterations done in this fit.
         interrupted_: whether Ctrl-C ended it.
     """
@@ -130,11 +133,14 @@ class TransformLearner(Alternation):
     def _code(self, volumes: Rows, rows: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
         """One pass over the volumes: `L X' / n`, and the part of the objective that `A` does not move."""
         cross, constant = np.zeros(rows.shape), 0.0
+        used = np.zeros(len(rows), bool)
         for _, chunk in chunks(volumes, self.chunk_size):
             codes = self._soft_threshold(chunk @ rows.T)
+            used |= codes.any(axis=0)
             cross += codes.T @ chunk
             constant += 0.5 * float(np.square(codes).sum(dtype=np.float64))
             constant += self.threshold * float(np.abs(codes).sum(dtype=np.float64))
+        self.unused_ = int(len(rows) - used.sum())
         return cross / volumes.shape[0], constant / volumes.shape[0]
 
     def _soft_threshold(self, z: NDArray[np.float32]) -> NDArray[np.float32]:
