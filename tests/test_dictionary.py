@@ -173,7 +173,8 @@ def test_coherence_falls_with_its_weight_and_conditions_the_dictionary():
 @pytest.mark.filterwarnings("ignore:Objective did not converge")
 def test_fewer_passes_than_scikit_learn_for_a_lower_objective():
     white = tiny.white_volumes(1500, 30).astype(np.float64)
-    mine = DictionaryLearner(45, threshold=0.3, max_iter=5, tol=0.0, random_state=0).fit(white)
+    mine = DictionaryLearner(45, threshold=0.3, coherence=0.0, max_iter=5, tol=0.0, random_state=0)
+    mine.fit(white)
     other = MiniBatchDictionaryLearning(
         45, alpha=0.3, max_iter=5, batch_size=256, fit_algorithm="cd", random_state=0
     ).fit(white)

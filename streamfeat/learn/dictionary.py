@@ -97,7 +97,7 @@ class DictionaryLearner(Alternation):
     n_atoms: int = 400
     _: KW_ONLY
     threshold: float = 1.0
-    coherence: float = 0.0
+    coherence: float = 0.1
     gap: float = 1e-3
     tol: float = 1e-3
 
