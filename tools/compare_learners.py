@@ -114,10 +114,9 @@ def main() -> None:
     print(f"{n:,} volumes, d = {d}, K = {k}, {os.cpu_count()} cores of {platform.machine()}")
 
     threshold = THRESHOLDS["inverse"]
-    inverse = DictionaryLearner(
-        k, threshold=threshold, coherence=0.0, max_iter=passes, tol=0.0, random_state=0
-    )
-    direct = TransformLearner(k, threshold=THRESHOLDS["direct"], max_iter=passes, tol=0.0, random_state=0)
+    both = {"max_iter": passes, "tol": 0.0, "random_state": 0}
+    inverse = DictionaryLearner(k, threshold=threshold, coherence=0.0, **both)
+    direct = TransformLearner(k, threshold=THRESHOLDS["direct"], **both)
     clone(inverse).set_params(max_iter=1).fit(white[: max(k, 300)])  # compiled before it is timed
     mine = timed_iterations(inverse, white)
     transform = timed_iterations(direct, white)
