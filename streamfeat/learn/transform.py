@@ -62,7 +62,8 @@ class TransformLearner(Alternation):
         n_filters: `K`.
         threshold: `lambda0`, not negative.
         conditioning: weight of `|A|_F^2 / 2`.
-        coherence: weight of `|A'A - I|_F^2 / 4`.
+        coherence: weight of `|A'A - I|_F^2 / 4`; at 0.1 digits are recognised less often (cross-validation
+            over four seeds 0.881, at 0.02 and at 0 0.893).
         log_det: weight of `-log|det A'A|`, or of `-log|det A X X' A'|` for `K < d`.
         max_iter: iterations at most, each of two half-steps.
         tol: stop when an iteration lowers the objective by less than this share.
@@ -87,7 +88,7 @@ class TransformLearner(Alternation):
     _: KW_ONLY
     threshold: float = 0.5
     conditioning: float = 0.1
-    coherence: float = 0.1
+    coherence: float = 0.02
     log_det: float = 0.1
     max_iter: int = 30
 
