@@ -23,8 +23,8 @@ class Omega:
 
         conditioning/2 |M|_F^2 + coherence/4 |M'M - I|_F^2 - log_det log|det M'M|,
 
-    `lambda1` being part of the three weights. Two readings are needed, as in Kostadinov, Voloshynovskiy and
-    Ferdowsi (2018) and in Ravishankar and Bresler (2013, eq. 4):
+    `lambda1` being part of the three weights, in the signs of Kostadinov, Voloshynovskiy and Ferdowsi (2018)
+    and, but for coherence, Ravishankar and Bresler (2013). Two readings are needed:
 
     - *Sign.* The coherence term is added: only then does its minimum mean low coherence.
     - *Which Gram matrix.* `|M'M - I_d|_F^2`, as printed, is that of a tight frame; the inner products between
