@@ -23,7 +23,6 @@ from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
-    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
@@ -46,7 +45,8 @@ Spread = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
 """Calls a function for each of some numbers: `map`, one after the other, or the `map` of an executor."""
 
 _WORTH_SPREADING = 1 << 20
-"""Codes, in filters times volumes: about a millisecond, against 0.1 for handing work to another thread."""
+"""Filters times volumes or entries that changed: a millisecond of work at least, against a tenth of one for
+handing half of it to another thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,15 +199,16 @@ class Engine:
         shape, operator, state = self.grid_shape, self._operator, self._state
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
-        if self._spread is map:
+        volumes = 0 if self._is_complete else shape[0] * shape[1]
+        large = max(volumes, int(state.clock[CLOCK_TOUCHED])) * operator.offset.shape[0] >= _WORTH_SPREADING
+        if self._spread is map or not large:
             update(shape, operator, state)
             return
         mark_dirty(shape, operator, state)
-        self._halves(int(state.clock[CLOCK_DIRTY]), lambda part: renew(part, shape, operator, state))
+        self._halves(lambda part: renew(part, shape, operator, state))
         settle(operator, state)
-        if not self._is_complete:
-            self._halves(shape[0] * shape[1], lambda part: complete(part, shape, operator, state))
-            finish(shape, state)
+        self._halves(lambda part: complete(part, shape, operator, state))
+        finish(shape, state)
 
     @property
     def _is_complete(self) -> bool:
@@ -215,10 +216,8 @@ class Engine:
         coded = state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED]
         return bool(coded == self.grid_shape[0] * self.grid_shape[1])
 
-    def _halves(self, volumes: int, work: Callable[[int], None]) -> None:
-        """Do both halves of some work on so many volumes, at once where that pays."""
-        large = volumes * self._operator.offset.shape[0] >= _WORTH_SPREADING
-        for _ in (self._spread if large else map)(work, range(PARTS)):
+    def _halves(self, work: Callable[[int], None]) -> None:
+        for _ in self._spread(work, range(PARTS)):
             pass
 
     @staticmethod
