@@ -254,7 +254,8 @@ def random_encoder(
     volumes = material.volumes(geometry, n_volumes)
     whitener = VolumeWhitener().fit(volumes)
     rng = np.random.RandomState(0)
-    filters = random_directions(whitener.transform(volumes), n_filters, rng)
+    white = whitener.transform(volumes)
+    filters = random_directions(white, np.square(white).sum(axis=1), n_filters, rng)
     parameters = {"threshold": 1.0 if formulation == "inverse" else 0.5} | parameters
     return sf.Encoder.build(
         geometry,

@@ -99,7 +99,7 @@ def _allocations(part: dict[str, Any]) -> Found:
 
 
 _DIRECT = "direct, one volume an event, `soft`:"
-_INVERSE = "inverse, an event and volume, gap 1e-4:"
+_INVERSE = "inverse, an event and volume, gap 1e-4, penalty lambda0 ="
 
 TARGETS = (
     Target("floors", f"{_DIRECT} time over the floor in C", 1.25, True, " x", _at("ours_over_floor")),
@@ -131,21 +131,15 @@ TARGETS = (
         " x",
         _at("over_ours", "FEAST of eventcv, 256 features"),
     ),
-    Target(
-        "inverse",
-        f"{_INVERSE} faster than scikit-learn lasso_cd",
-        300,
-        False,
-        " x",
-        _at("over_ours", "scikit-learn lasso_cd"),
-    ),
-    Target(
-        "inverse",
-        f"{_INVERSE} faster than SPAMS, batched, one thread",
-        8,
-        False,
-        " x",
-        _at("over_ours", "SPAMS, batch, 1 thread"),
+    *(
+        Target(
+            "inverse", f"{_INVERSE} {penalty}: faster than {name}", bound, False, " x", _at(penalty, *keys)
+        )
+        for penalty in ("1", "2", "4")
+        for name, bound, keys in (
+            ("scikit-learn lasso_cd", 300, ("over_ours", "scikit-learn lasso_cd")),
+            ("SPAMS, batched, one thread", 8, ("over_ours", "SPAMS, batch, 1 thread")),
+        )
     ),
     Target(
         "ingest",
