@@ -17,7 +17,7 @@ LAYERS = [
     {"geometry", "files", "messages", "mcap_records", "svm", "simulate"},
     {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
     {"kernels.encode", "codecs", "safe_arrays"},
-    {"kernels.planes"},
+    {"kernels.planes", "packets"},
     {"kernels.update", "kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
