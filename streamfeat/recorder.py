@@ -177,7 +177,7 @@ class RecordingWriter:
             self._write_packet(block, resolution)
             start += len(block)
 
-    def write_label(self, label: Label) -> None:
+    def write_label(self, label: Label, topic: str = "/label") -> None:
         """Write a label; do so before the events it speaks of.
 
         Raises:
@@ -191,23 +191,29 @@ class RecordingWriter:
             label.split,
             label.source,
         )
-        self._write("/label", message)
+        self._write(topic, message)
 
-    def write_features(self, t_us: int, n_events: int, data: ArrayLike) -> None:
+    def write_features(
+        self, t_us: int, n_events: int, data: ArrayLike, *, incomplete: bool = False, topic: str = "/features"
+    ) -> None:
         """Write the features at a stream time.
 
         Args:
             t_us: stream time, microseconds.
             n_events: events that went into them.
             data: `(n,)`, stored as float32, not changed.
+            incomplete: packets are known to be missing from the window.
+            topic: to write to.
 
         Raises:
             InputError: the time is out of range.
         """
         values = np.asarray(data, np.float32)
-        self._write("/features", FeaturesMessage(t_us * 1000, self._frame_id, n_events, values))
+        self._write(topic, FeaturesMessage(t_us * 1000, self._frame_id, n_events, values, incomplete))
 
-    def write_prediction(self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike) -> None:
+    def write_prediction(
+        self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike, *, topic: str = "/prediction"
+    ) -> None:
         """Write a prediction at a stream time.
 
         Args:
@@ -215,12 +221,13 @@ class RecordingWriter:
             label: the winner.
             labels: all labels.
             scores: `(len(labels),)`, stored as float32, not changed.
+            topic: to write to.
 
         Raises:
             InputError: the time is out of range.
         """
         values = np.asarray(scores, np.float32)
-        self._write("/prediction", PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
+        self._write(topic, PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
 
     def _write_packet(self, events: Events, resolution: Resolution) -> None:
         payload, time_base_ns = encode(events, self._encoding, self._after_us)

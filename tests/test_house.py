@@ -24,7 +24,7 @@ LAYERS = [
     {"encoder", "sinks"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
-    {"pipeline"},
+    {"cameras", "pipeline"},
     {"replay"},
     {"cli"},
 ]
@@ -38,7 +38,7 @@ ROOMS = {
 """The same inside packages that are one place in the layers."""
 
 ONLY_IN = {
-    "asyncio": {"pipeline", "replay"},
+    "asyncio": {"pipeline"},
     "mcap": {"mcap_records", "recording", "recorder"},
     "zenoh": {"live"},
     "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.streaming"},
