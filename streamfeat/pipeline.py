@@ -21,6 +21,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from threading import current_thread, main_thread
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
@@ -208,7 +209,9 @@ def run_until_interrupted(
 
     async def run() -> None:
         loop = asyncio.get_running_loop()
-        for name in (signal.SIGINT, signal.SIGTERM):
+        # Only the main thread of a process can be told of signals.
+        names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+        for name in names:
             loop.add_signal_handler(name, on_signal)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -217,7 +220,7 @@ def run_until_interrupted(
         except BaseExceptionGroup as group:
             raise group.exceptions[0] from None
         finally:
-            for name in (signal.SIGINT, signal.SIGTERM):
+            for name in names:
                 loop.remove_signal_handler(name)
 
     asyncio.run(run())

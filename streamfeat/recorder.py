@@ -16,17 +16,13 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
-from streamfeat.codecs import encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
 from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.recording import Label
+from streamfeat.packets import Label, PacketWriter
 
 __all__ = ["RecordingWriter", "recover"]
-
-PACKET_EVENTS = 8192
-PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
 
 _COMPRESSION = {
     "zstd": CompressionType.ZSTD,
@@ -98,16 +94,14 @@ class RecordingWriter:
         Raises:
             InputError: the encoding or compression is unknown, or the file exists or cannot be written.
         """
-        make_decoder(encoding)
         if compression not in _COMPRESSION:
             raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + part_suffix)
         self._overwrite, self._keep_partial = overwrite, keep_partial
-        self._encoding, self._event_topic, self._frame_id = encoding, event_topic, frame_id
+        self._event_topic, self._frame_id = event_topic, frame_id
+        self._packets = PacketWriter(encoding, frame_id)
         self._channels: dict[str | int, int] = {}
-        self._seq = 0
-        self._after_us = 0
         self._check_target()
         try:
             self._file = self._part.open("xb")
@@ -169,13 +163,8 @@ class RecordingWriter:
             InputError: the encoding cannot represent the events (see `streamfeat.codecs.encode`), or a
                 time is negative or 2^31 s or more.
         """
-        start = 0
-        while start < len(events):
-            block = events[start : start + PACKET_EVENTS]
-            far = np.flatnonzero(np.abs(block["t"] - block["t"][0]) >= PACKET_US)
-            block = block[: far[0]] if len(far) else block
-            self._write_packet(block, resolution)
-            start += len(block)
+        for packet in self._packets.messages(events, resolution):
+            self._write(self._event_topic, packet)
 
     def write_label(self, label: Label, topic: str = "/label") -> None:
         """Write a label; do so before the events it speaks of.
@@ -228,24 +217,6 @@ class RecordingWriter:
         """
         values = np.asarray(scores, np.float32)
         self._write(topic, PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
-
-    def _write_packet(self, events: Events, resolution: Resolution) -> None:
-        payload, time_base_ns = encode(events, self._encoding, self._after_us)
-        height, width = resolution
-        packet = EventPacket(
-            int(events["t"].min()) * 1000,
-            self._frame_id,
-            height,
-            width,
-            self._seq,
-            time_base_ns,
-            self._encoding,
-            False,
-            payload,
-        )
-        self._write(self._event_topic, packet)
-        self._seq += 1
-        self._after_us = int(events["t"][-1])
 
     def _write(self, topic: str, message: _Message) -> None:
         data = message.to_cdr()

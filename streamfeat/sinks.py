@@ -37,14 +37,17 @@ class Sink(Protocol[T]):
         """End: finish what was written, or (`failed`) leave nothing half done behind."""
 
 
-def open_sinks(*makers: Callable[[], Sink[T]] | None) -> list[Sink[T]]:
+S = TypeVar("S", bound=Sink[Any])
+
+
+def open_sinks(*makers: Callable[[], S] | None) -> list[S]:
     """Make the sinks that are wanted: all of them or, when one cannot be made, none is left open.
 
     Args:
         makers: without arguments; what is None is not wanted.
     """
     with ExitStack() as opening:
-        sinks: list[Sink[T]] = []
+        sinks: list[S] = []
         for make in makers:
             if make:
                 sinks.append(make())

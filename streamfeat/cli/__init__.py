@@ -10,11 +10,11 @@ from typing import NoReturn
 
 from rich.markup import escape
 
-from streamfeat.cli import learning, recordings, streaming
+from streamfeat.cli import learning, live, recordings, streaming
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
-__all__ = ["app", "learning", "main", "recordings", "streaming"]
+__all__ = ["app", "learning", "live", "main", "recordings", "streaming"]
 
 
 def main() -> NoReturn:

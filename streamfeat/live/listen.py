@@ -1,0 +1,159 @@
+"""The main job on live topics: events in, features and predictions out, until somebody stops it.
+
+Lives here: putting together what listening needs, and ending well.
+Not here: each of the parts.
+"""
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.console import Console
+
+from streamfeat.cameras import Cameras, Gone
+from streamfeat.classifier import Classifier
+from streamfeat.emission import Emission, EmitPolicy
+from streamfeat.encoder import Encoder
+from streamfeat.errors import InputError
+from streamfeat.live.health import Health, parse_address
+from streamfeat.live.inbox import Inbox
+from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.names import Names, beside
+from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.publisher import OutputSink
+from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.recorder import RecordingWriter
+from streamfeat.session import Session, StreamItem
+from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
+
+__all__ = ["Listen"]
+
+_PATIENCE_NS = 50_000_000
+"""A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
+
+
+class Listen:
+    """Listens on topics until `stop` or a signal.
+
+    Args:
+        names: of the topics.
+        model: of the encoder.
+        classifier: to predict with; none for features alone.
+        emit: when to read, see `EmitPolicy.parse`.
+        learn_online: learn from labels that are published beside the events.
+        reliable: recover missed packets and ask for history, from publishers that do the same.
+        zenoh_config: JSON5 file; without it, this machine alone.
+        port: where sessions on this machine meet.
+        metrics: `HOST:PORT` to serve Prometheus metrics on.
+        silence_s: how long a camera must be silent before its time goes on without it.
+        console: for warnings.
+
+    Raises:
+        InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        names: Names,
+        model: Path,
+        classifier: Path | None = None,
+        *,
+        emit: str = "auto",
+        learn_online: bool = False,
+        reliable: bool = False,
+        zenoh_config: Path | None = None,
+        port: int = DEFAULT_PORT,
+        metrics: str | None = None,
+        silence_s: float = SILENCE_S,
+        console: Console | None = None,
+    ) -> None:
+        """Open and check everything but the network, before anything is written."""
+        self._policy = EmitPolicy.parse(emit)
+        self._encoder = Encoder.load(model)
+        self._classifier = Classifier.load(classifier) if classifier else None
+        if self._classifier:
+            self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
+        elif learn_online:
+            raise InputError("--learn-online needs a classifier to start from; give one with -c")
+        self._address = parse_address(metrics) if metrics else None
+        self._names = names
+        self._learn_online, self._reliable = learn_online, reliable
+        self._zenoh_config, self._port = zenoh_config, port
+        self.interrupted = False
+        self._warnings = Warnings(partial(_say, console) if console else lambda line: None)
+        self._inbox = Inbox()
+        window_us = self._encoder.geometry.window_us
+        self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s)
+        self._cameras = Cameras(self._make_session, on_refusal=self._on_refusal)
+        self.health = Health(self._cameras, self._intake, self._inbox, self._warnings)
+
+    def run(
+        self,
+        *,
+        console: Console | None = None,
+        recording_out: Path | None = None,
+        json_lines: Path | TextIO | None = None,
+        with_features: bool = False,
+        more: Sink[Emission] | None = None,
+    ) -> None:
+        """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
+
+        Args:
+            console: for live lines.
+            recording_out: MCAP file for features and predictions; replaced if it exists.
+            json_lines: file (replaced) or open stream for a JSON line for each emission.
+            with_features: include features in JSON lines.
+            more: one sink more.
+
+        Raises:
+            InputError: an output, the network or the metrics address cannot be used.
+        """
+        with open_session(self._zenoh_config, port=self._port) as session:
+            sinks = open_sinks(
+                partial(OutputSink, session, self._names, self.health.on_published),
+                partial(TerminalSink, console) if console else None,
+                partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
+                partial(_recording_sink, recording_out) if recording_out else None,
+                (lambda: more) if more else None,
+            )
+            pipeline: Pipeline[StreamItem | Gone, Emission] = Pipeline(self._intake, self.health, sinks)
+            self.health.queues = pipeline.stats
+            try:
+                if self._address:
+                    self.health.serve(*self._address)
+                with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+                    self.interrupted = run_until_interrupted([pipeline], self.stop)
+            finally:
+                self.health.stop_serving()
+
+    def stop(self) -> None:
+        """Take in no more; may be called from any thread."""
+        self._inbox.close()
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        return self.health.result() | {"interrupted": self.interrupted}
+
+    def _make_session(self, topic: str) -> Session:
+        return Session(
+            self._encoder,
+            self._policy,
+            self._classifier,
+            learn_online=self._learn_online,
+            clock=time.perf_counter,
+            topic=topic,
+            is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > _PATIENCE_NS,
+        )
+
+    def _on_refusal(self, topic: str, reason: str, error: str) -> None:
+        self._warnings.add(reason, topic, error)
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, style="yellow", markup=False, soft_wrap=True)
+
+
+def _recording_sink(path: Path) -> RecordingSink:
+    writer = RecordingWriter(path, overwrite=True, keep_partial=True, compression="lz4")
+    return RecordingSink(writer, lambda topic, kind: "/" + beside(topic, kind).lstrip("/"))
