@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
-from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.packets import Label, PacketWriter
 
 __all__ = ["RecordingWriter", "recover"]
@@ -218,12 +218,30 @@ class RecordingWriter:
         values = np.asarray(scores, np.float32)
         self._write(topic, PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
 
+    def write_message(
+        self, topic: str, kind: type[_Message | EventArray], data: bytes, log_time_ns: int, sequence: int
+    ) -> None:
+        """Write a message as it came.
+
+        Args:
+            topic: to write to.
+            kind: its type; that the bytes are of it is not checked.
+            data: the CDR bytes.
+            log_time_ns: when it came, since 1970.
+            sequence: its number, 32 bits.
+        """
+        self._add(self._channel(topic, kind), log_time_ns, data, log_time_ns, sequence)
+
     def _write(self, topic: str, message: _Message) -> None:
         data = message.to_cdr()
-        if topic not in self._channels:
-            schema = self._writer.register_schema(message.SCHEMA_NAME, "ros2msg", message.SCHEMA.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        self._add(self._channels[topic], message.stamp_ns, data, message.stamp_ns, 0)
+        self._add(self._channel(topic, type(message)), message.stamp_ns, data, message.stamp_ns, 0)
+
+    def _channel(self, topic: str, kind: type[_Message | EventArray]) -> int:
+        which = f"{topic} {kind.SCHEMA_NAME}"
+        if which not in self._channels:
+            schema = self._writer.register_schema(kind.SCHEMA_NAME, "ros2msg", kind.SCHEMA.encode())
+            self._channels[which] = self._writer.register_channel(topic, "cdr", schema)
+        return self._channels[which]
 
     def _copy(self, channel: Channel, schema: Schema, message: Message) -> None:
         """Write a message of another recording as it is; do not mix with the public ways to write."""

@@ -1,4 +1,4 @@
-"""Commands for live topics: listen, publish, record, topics.
+"""Commands for live topics: listen, publish, record, recover, topics.
 
 Lives here: their arguments, and how their results are shown.
 Not here: the jobs (`live`).
@@ -17,6 +17,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_losses,
     print_result,
     refuse_existing,
 )
@@ -25,7 +26,7 @@ from streamfeat.errors import InputError
 if TYPE_CHECKING:
     from streamfeat.live.names import Names
 
-__all__ = ["listen", "publish", "topics"]
+__all__ = ["listen", "publish", "record", "recover", "topics"]
 
 KeyArgument = Annotated[
     str | None, typer.Argument(metavar="KEYEXPR", help="zenoh key expression, such as robot/*/events.")
@@ -158,6 +159,55 @@ def publish(
     )
     job.run()
     print_result(job.result(), "published", as_json=as_json)
+
+
+@app.command(epilog="Example: streamfeat record 'robot/*/events' -o drive.mcap")
+def record(
+    output: Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")],
+    key: KeyArgument = None,
+    compression: Annotated[str, typer.Option(help="Chunks: lz4, zstd or none.")] = "lz4",
+    chunk: Annotated[float, typer.Option(help="Seconds that a crash can cost.")] = 0.5,
+    ros2: RosOption = None,
+    domain: DomainOption = 0,
+    reliable: ReliableOption = False,
+    zenoh_config: ConfigOption = None,
+    port: PortOption = 7447,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
+    from streamfeat.live.record import Record
+
+    refuse_existing(output, overwrite=overwrite)
+    job = Record(
+        _names(key, ros2, domain),
+        output,
+        compression=compression,  # type: ignore[arg-type]
+        chunk_s=chunk,
+        overwrite=overwrite,
+        reliable=reliable,
+        zenoh_config=zenoh_config,
+        port=port,
+        console=err,
+    )
+    job.run()
+    print_result(job.result(), "recorded", as_json=as_json)
+
+
+@app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
+def recover(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Damaged or unfinished recording.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Whatever can be read of a damaged recording, in a new and intact one."""
+    from streamfeat.recorder import recover as recover_recording
+
+    losses = recover_recording(source, target, overwrite=overwrite)
+    result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
+    print_result(result, "recovered", as_json=as_json)
+    print_losses(losses)
 
 
 @app.command(epilog="Example: streamfeat topics --json")

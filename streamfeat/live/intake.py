@@ -12,8 +12,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Self
 
 import numpy as np
+from rich.console import Console
 
 from streamfeat.cameras import Gone
 from streamfeat.errors import InputError
@@ -60,6 +63,13 @@ class Warnings:
         self._clock = clock
         self._next: dict[str, float] = {}
         self._silent: Counter[str] = Counter()
+
+    @classmethod
+    def on(cls, console: Console | None) -> Self:
+        """Say it there, or only count."""
+        if console is None:
+            return cls()
+        return cls(partial(console.print, style="yellow", markup=False, soft_wrap=True))
 
     def add(self, reason: str, topic: str, detail: str) -> None:
         """Count one, and say it unless that reason was said less than a second ago."""

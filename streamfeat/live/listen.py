@@ -13,15 +13,18 @@ from rich.console import Console
 
 from streamfeat.cameras import Cameras, Gone
 from streamfeat.classifier import Classifier
+from streamfeat.codecs import ENCODINGS, encode, make_decoder
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
+from streamfeat.events import make_events
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import SILENCE_S, Intake, Warnings
 from streamfeat.live.names import Names, beside
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.publisher import OutputSink
+from streamfeat.packets import Packet
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
 from streamfeat.session import Session, StreamItem
@@ -81,7 +84,7 @@ class Listen:
         self._learn_online, self._reliable = learn_online, reliable
         self._zenoh_config, self._port = zenoh_config, port
         self.interrupted = False
-        self._warnings = Warnings(partial(_say, console) if console else lambda line: None)
+        self._warnings = Warnings.on(console)
         self._inbox = Inbox()
         window_us = self._encoder.geometry.window_us
         self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s)
@@ -109,6 +112,7 @@ class Listen:
         Raises:
             InputError: an output, the network or the metrics address cannot be used.
         """
+        self._warm_up()
         with open_session(self._zenoh_config, port=self._port) as session:
             sinks = open_sinks(
                 partial(OutputSink, session, self._names, self.health.on_published),
@@ -135,6 +139,22 @@ class Listen:
         """What happened, as JSON values."""
         return self.health.result() | {"interrupted": self.interrupted}
 
+    def _warm_up(self) -> None:
+        """Compile what the first packets would otherwise have to wait for."""
+        geometry = self._encoder.geometry
+        side = geometry.patch * geometry.downsample
+        event = make_events([0], [0], [1], [0])
+        for encoding in ENCODINGS:
+            payload, base_ns = encode(event, encoding)
+            make_decoder(encoding).decode(payload, base_ns)
+        # One in time and one too late: the two ways to feed.
+        for log_time_ns in (time.time_ns(), 0):
+            session = self._make_session("")
+            for _ in session.process(Packet("", event, (side, side), log_time_ns, 0)):
+                pass
+            for _ in session.finish():
+                pass
+
     def _make_session(self, topic: str) -> Session:
         return Session(
             self._encoder,
@@ -148,10 +168,6 @@ class Listen:
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
         self._warnings.add(reason, topic, error)
-
-
-def _say(console: Console, line: str) -> None:
-    console.print(line, style="yellow", markup=False, soft_wrap=True)
 
 
 def _recording_sink(path: Path) -> RecordingSink:

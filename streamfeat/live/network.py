@@ -32,6 +32,10 @@ __all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "find_topics", "open_se
 DEFAULT_PORT = 7447
 _MAX_MESSAGE_BYTES = 16 << 20
 """What zenoh puts together from fragments; a message of more never reaches us."""
+_QUEUED_BATCHES = 16
+"""Of 64 kB, the most that zenoh allows: a reader that hesitates costs a camera nothing yet."""
+_PATIENCE = {"drop": {"wait_before_drop": 50_000}, "block": {"wait_before_close": 60_000_000}}
+"""Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
 _HISTORY = 256
 """Packets that a reliable subscriber asks a publisher for when it joins late."""
 
@@ -78,7 +82,12 @@ def _loopback(listen: list[str], connect: list[str]) -> zenoh.Config:
                 },
                 "scouting": {"multicast": {"enabled": False}},
                 "timestamping": {"enabled": True},
-                "transport": {"link": {"rx": {"max_message_size": _MAX_MESSAGE_BYTES}}},
+                "transport": {
+                    "link": {
+                        "rx": {"max_message_size": _MAX_MESSAGE_BYTES},
+                        "tx": {"queue": {"size": {"data": _QUEUED_BATCHES}, "congestion_control": _PATIENCE}},
+                    }
+                },
             }
         )
     )
