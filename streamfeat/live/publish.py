@@ -148,5 +148,6 @@ def _items(recording: Recording, *, loop: bool) -> Iterator[Packet | Label]:
 def _wait_for_readers(session: zenoh.Session, key: str, seconds: float) -> None:
     with session.declare_publisher(key) as probe:
         until = time.monotonic() + seconds
-        while not probe.matching_status and time.monotonic() < until:
+        # A status is an object, whatever its type hint says.
+        while not probe.matching_status.matching and time.monotonic() < until:  # type: ignore[attr-defined]
             time.sleep(_POLL_S)
