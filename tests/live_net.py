@@ -58,6 +58,16 @@ def plain_publisher(session, key, **options):
         yield publisher
 
 
+def until_heard(session, key, *jobs):
+    """Wait until jobs hear a key: each refuses the empty message that is put there."""
+
+    def heard():
+        session.put(key, b"")
+        return all(job.result()["warnings"] for job in jobs)
+
+    until(heard, f"hearing {key}")
+
+
 def attachment(seq, gid=b"0123456789abcdef", source_ns=0):
     """33 bytes as the design document of rmw_zenoh has them."""
     return struct.pack("<q", seq) + struct.pack("<q", source_ns) + bytes([16]) + gid
