@@ -78,13 +78,13 @@ class Collector:
 
     def __init__(self, session, expression):
         self.samples = []
-        self._subscriber = session.declare_subscriber(expression, self._take)
+        self._subscriber = session.declare_subscriber(
+            expression, self._take, allowed_origin=zenoh.Locality.REMOTE
+        )
 
     def _take(self, sample):
         attached = sample.attachment.to_bytes() if sample.attachment else b""
-        self.samples.append(
-            (str(sample.key_expr), sample.payload.to_bytes(), attached, str(sample.encoding))
-        )
+        self.samples.append((str(sample.key_expr), sample.payload.to_bytes(), attached, str(sample.encoding)))
 
     def of(self, ending):
         """Payloads of keys with this ending."""

@@ -85,7 +85,9 @@ def test_a_publisher_whose_predecessor_left_need_not_wait():
 
 def test_two_publishers_on_one_key_the_first_stays():
     delivery = Delivery()
-    used = [(delivery.see(ONE, n, 10 * n).use, delivery.see(TWO, 500 + n, 10 * n + 5).use) for n in range(1, 50)]
+    used = [
+        (delivery.see(ONE, n, 10 * n).use, delivery.see(TWO, 500 + n, 10 * n + 5).use) for n in range(1, 50)
+    ]
     assert used == [(True, False)] * 49
     assert delivery.stats == DeliveryStats(received=49, foreign=49)
     # When the first falls silent, the second takes over; its earlier numbers are not counted as lost.

@@ -67,7 +67,10 @@ def test_ros_tokens():
 def test_attachments():
     """8 bytes number, 8 bytes nanoseconds, both little-endian, the byte 16, 16 bytes of GID."""
     data = (
-        b"\x2a\0\0\0\0\0\0\0" + b"\x15\xcd\x5b\x07\0\0\0\0" + b"\x10" + b"\x00\x01\x02\x03\x04\x05\x06\x07" * 2
+        b"\x2a\0\0\0\0\0\0\0"
+        + b"\x15\xcd\x5b\x07\0\0\0\0"
+        + b"\x10"
+        + b"\x00\x01\x02\x03\x04\x05\x06\x07" * 2
     )
     expected = Attachment(42, 123456789, bytes(range(8)) * 2)
     assert len(data) == 33
@@ -121,7 +124,9 @@ def test_encodings_name_types():
     assert schema_of_encoding("text/plain;x") is None
 
 
-@pytest.mark.parametrize(("topic", "domain"), [("events", 0), ("/events/", 0), ("/events", -1), ("/events", 233)])
+@pytest.mark.parametrize(
+    ("topic", "domain"), [("events", 0), ("/events/", 0), ("/events", -1), ("/events", 233)]
+)
 def test_ros_names_that_are_none(topic, domain):
     with pytest.raises(InputError, match="ROS 2"):
         RosNames(topic, domain)

@@ -32,7 +32,7 @@ from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, o
 
 __all__ = ["Listen"]
 
-_PATIENCE_NS = 50_000_000
+PATIENCE_S = 0.05
 """A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
 
 
@@ -50,6 +50,7 @@ class Listen:
         port: where sessions on this machine meet.
         metrics: `HOST:PORT` to serve Prometheus metrics on.
         silence_s: how long a camera must be silent before its time goes on without it.
+        patience_s: how long packets may wait before readings are left out for them.
         console: for warnings.
 
     Raises:
@@ -69,6 +70,7 @@ class Listen:
         port: int = DEFAULT_PORT,
         metrics: str | None = None,
         silence_s: float = SILENCE_S,
+        patience_s: float = PATIENCE_S,
         console: Console | None = None,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
@@ -83,6 +85,7 @@ class Listen:
         self._names = names
         self._learn_online, self._reliable = learn_online, reliable
         self._zenoh_config, self._port = zenoh_config, port
+        self._patience_ns = patience_s * 1e9
         self.interrupted = False
         self._warnings = Warnings.on(console)
         self._inbox = Inbox()
@@ -163,7 +166,7 @@ class Listen:
             learn_online=self._learn_online,
             clock=time.perf_counter,
             topic=topic,
-            is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > _PATIENCE_NS,
+            is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > self._patience_ns,
         )
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
