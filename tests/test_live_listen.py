@@ -49,7 +49,7 @@ def files(tmp_path_factory):
 
 
 def listener(files, expression="cam/*/events", classifier=True, **options):
-    options = {"silence_s": NEVER, "patience_s": NEVER, "port": free_port()} | options
+    options = {"silence_s": NEVER, "patience_s": NEVER, "max_delay_s": NEVER, "port": free_port()} | options
     chosen = files / "classifier" if classifier else None
     return Listen(PlainNames(expression), files / "model", chosen, **options)
 

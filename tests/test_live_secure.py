@@ -135,6 +135,7 @@ def test_certificates_and_access_control(folder):
         zenoh_config=config,
         silence_s=1e9,
         patience_s=1e9,
+        max_delay_s=1e9,
     )
     events = [tiny.steady(i * 10_000, (i + 1) * 10_000, 50, seed=i) for i in range(20)]
     key = "robot/cam0/events"

@@ -80,6 +80,9 @@ def listen(
     ros2: RosOption = None,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
+    max_delay: Annotated[
+        float, typer.Option(help="Seconds that packets may wait before the oldest are dropped.")
+    ] = 1.0,
     metrics: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
     ] = None,
@@ -106,6 +109,7 @@ def listen(
         zenoh_config=zenoh_config,
         port=port,
         metrics=metrics,
+        max_delay_s=max_delay,
         console=err,
     )
     to_terminal = str(json_lines) == "-"

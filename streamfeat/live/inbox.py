@@ -3,9 +3,11 @@
 Lives here: one bounded queue that never makes the network wait.
 Not here: what messages mean (`intake`), and who puts them in (`network`).
 
-When it is full, whole messages are dropped, the oldest first, and counted for their topic.
+When it is full, or the oldest has waited too long, whole messages are dropped, the oldest first, and counted
+for their topic.
 """
 
+import math
 import threading
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -50,11 +52,13 @@ class Inbox:
 
     Args:
         max_bytes: of payloads, with 512 more for each message.
+        max_delay_s: how much older than the newest message the oldest may be.
     """
 
-    def __init__(self, max_bytes: int = _MAX_BYTES) -> None:
+    def __init__(self, max_bytes: int = _MAX_BYTES, max_delay_s: float = math.inf) -> None:
         """Start empty and open."""
         self._max_bytes = max_bytes
+        self._max_delay_ns = max_delay_s * 1e9
         self._items: deque[RawMessage | Gone] = deque()
         self._bytes = 0
         self._dropped: Counter[str] = Counter()
@@ -75,13 +79,12 @@ class Inbox:
             self._items.append(item)
             if isinstance(item, RawMessage):
                 self._bytes += len(item.payload) + _OVERHEAD
-            if self._bytes > self._max_bytes:
-                self._drop_oldest()
+                self._drop_oldest(item.arrived_ns - self._max_delay_ns)
             self._changed.notify()
 
-    def _drop_oldest(self) -> None:
+    def _drop_oldest(self, limit_ns: float) -> None:
         kept = []
-        while self._bytes > self._max_bytes:
+        while self._items and (self._bytes > self._max_bytes or self._arrived_ns(self._items[0]) < limit_ns):
             oldest = self._items.popleft()
             if isinstance(oldest, RawMessage):
                 self._bytes -= len(oldest.payload) + _OVERHEAD
@@ -90,6 +93,10 @@ class Inbox:
             else:
                 kept.append(oldest)
         self._items.extendleft(reversed(kept))
+
+    @staticmethod
+    def _arrived_ns(item: RawMessage | Gone) -> float:
+        return item.arrived_ns if isinstance(item, RawMessage) else math.inf
 
     def take(self, timeout: float) -> list[RawMessage | Gone] | None:
         """Take what is there, at most 64; wait if there is nothing.

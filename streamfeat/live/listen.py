@@ -36,6 +36,10 @@ PATIENCE_S = 0.05
 """A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
 
 
+MAX_DELAY_S = 1.0
+"""Where even feeding cannot keep up, packets are dropped rather than being ever further behind."""
+
+
 class Listen:
     """Listens on topics until `stop` or a signal.
 
@@ -51,6 +55,7 @@ class Listen:
         metrics: `HOST:PORT` to serve Prometheus metrics on.
         silence_s: how long a camera must be silent before its time goes on without it.
         patience_s: how long packets may wait before readings are left out for them.
+        max_delay_s: how long packets may wait before the oldest are dropped.
         console: for warnings.
 
     Raises:
@@ -71,6 +76,7 @@ class Listen:
         metrics: str | None = None,
         silence_s: float = SILENCE_S,
         patience_s: float = PATIENCE_S,
+        max_delay_s: float = MAX_DELAY_S,
         console: Console | None = None,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
@@ -88,7 +94,7 @@ class Listen:
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
         self._warnings = Warnings.on(console)
-        self._inbox = Inbox()
+        self._inbox = Inbox(max_delay_s=max_delay_s)
         window_us = self._encoder.geometry.window_us
         self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s)
         self._cameras = Cameras(self._make_session, on_refusal=self._on_refusal)
