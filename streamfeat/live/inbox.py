@@ -9,6 +9,7 @@ for their topic.
 
 import math
 import threading
+import time
 from collections import Counter, deque
 from dataclasses import dataclass
 
@@ -52,7 +53,7 @@ class Inbox:
 
     Args:
         max_bytes: of payloads, with 512 more for each message.
-        max_delay_s: how much older than the newest message the oldest may be.
+        max_delay_s: how long a message may wait.
     """
 
     def __init__(self, max_bytes: int = _MAX_BYTES, max_delay_s: float = math.inf) -> None:
@@ -107,6 +108,8 @@ class Inbox:
         with self._changed:
             if not self._items and not self._closed:
                 self._changed.wait(timeout)
+            # Also when nothing new comes: what waits too long is dropped before it is taken.
+            self._drop_oldest(time.monotonic_ns() - self._max_delay_ns)
             if not self._items:
                 return None if self._closed else []
             taken = [self._items.popleft() for _ in range(min(len(self._items), _TAKEN_AT_ONCE))]
