@@ -210,10 +210,11 @@ class Session:
     def _engine_for(self, resolution: Resolution) -> Engine:
         if self._engine and self._engine.resolution == resolution:
             return self._engine
+        engine = Engine(self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event)
         if self._engine:
             _add_engine(self._stats, self._engine)
-        self._engine = Engine(self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event)
-        return self._engine
+        self._engine = engine
+        return engine
 
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         done = 0
