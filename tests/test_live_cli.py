@@ -132,7 +132,8 @@ def test_publish_until_interrupted(files):
         with started(*words, "--port", port, "--wait", "60", "--json") as publisher:
             until(lambda: job.result()["samples"] > 2 and job._cameras.topics)
             with open_session(port=port) as net:
-                assert find_topics(net) == [FoundTopic("cam/a/events", "zenoh", -1, 1)]
+                expected = [FoundTopic("cam/a/events", "zenoh", -1, 1)]
+                until(lambda: find_topics(net, 0.1) == expected)
             publisher.send_signal(signal.SIGINT)
             text, errors = publisher.communicate(timeout=60)
         published = json.loads(text)

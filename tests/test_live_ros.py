@@ -70,7 +70,8 @@ def test_listening_to_a_ros_camera(model):
             seen = [str(reply.ok.key_expr).split("/") for reply in net.liveliness().get("@ros2_lv/0/**")]
             ours = sorted(chunks[5:] for chunks in seen if chunks[2] != ZID)
             zids = {chunks[2] for chunks in seen if chunks[2] != ZID}
-            assert find_topics(net) == [FoundTopic("/event_camera/events", "ros2", 0, 1)]
+            expected = [FoundTopic("/event_camera/events", "ros2", 0, 1)]
+            until(lambda: find_topics(net, 0.05) == expected)
             token.undeclare()
             until(lambda: job._cameras.topics == [])
     assert zids != set()
@@ -166,7 +167,7 @@ def test_topics_of_both_kinds_are_found():
                 f"{PlainNames('x').token('robot/cam0/events', bytes.fromhex(gid))}",
             )
         ]
-        found = until(lambda: len(topics := find_topics(net)) == 3 and topics)
+        found = until(lambda: len(topics := find_topics(net, 0.05)) == 3 and topics)
         assert found == [
             FoundTopic("/event_camera/events", "ros2", 0, 2),
             FoundTopic("/event_camera/events", "ros2", 7, 1),
@@ -174,4 +175,4 @@ def test_topics_of_both_kinds_are_found():
         ]
         for token in tokens:
             token.undeclare()
-        until(lambda: find_topics(net) == [])
+        until(lambda: find_topics(net, 0.05) == [])

@@ -216,7 +216,7 @@ def recover(
 
 @app.command(epilog="Example: streamfeat topics --json")
 def topics(
-    seconds: Annotated[float, typer.Option(help="How long to wait for answers.")] = 1.0,
+    seconds: Annotated[float, typer.Option(help="How long to listen.")] = 1.0,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     as_json: JsonOption = False,

@@ -227,27 +227,37 @@ class FoundTopic:
 
 
 def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic]:
-    """Ask the network who publishes events; publishers of plain keys are found if they declare a token.
+    """Listen to who publishes events; publishers of plain keys are found if they declare a token.
 
     Args:
         session: open.
-        seconds: how long to wait for sessions to find one another, and then for answers.
+        seconds: how long; sessions need some milliseconds to find one another.
     """
-    known = time.monotonic() + seconds
-    while not (session.info.peers_zid() or session.info.routers_zid()) and time.monotonic() < known:
-        time.sleep(0.02)
+    tokens: dict[str, None] = {}
+
+    def on_token(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            tokens[str(sample.key_expr)] = None
+        else:
+            tokens.pop(str(sample.key_expr), None)
+
+    plain, ros = PlainNames("**"), RosNames("/any")
+    expressions = (plain.tokens, ros.tokens.replace(f"/{ros.domain}/", "/*/", 1))
+    callback = Callback(on_token, indirect=False)
+    watching = [
+        session.liveliness().declare_subscriber(expression, callback, history=True)
+        for expression in expressions
+    ]
+    time.sleep(seconds)
+    for one in watching:
+        one.undeclare()  # type: ignore[no-untyped-call]
     found: Counter[tuple[str, str, int]] = Counter()
-    plain = PlainNames("**")
-    for token in _tokens(session, plain.tokens, seconds):
-        found[plain.token_topic(token), "zenoh", -1] += 1
-    for token in _tokens(session, "@ros2_lv/*/*/*/*/MP/*/*/*/*/*/*/*", seconds):
-        domain = int(token.split("/")[1]) if token.split("/")[1].isdecimal() else 0
-        topic = RosNames("/x").token_topic(token)
-        if topic:
-            found[topic, "ros2", domain] += 1
+    for token in list(tokens):
+        if token.startswith("@ros2_lv/"):
+            domain = token.split("/")[1]
+            topic = ros.token_topic(token)
+            if topic and domain.isdecimal():
+                found[topic, "ros2", int(domain)] += 1
+        else:
+            found[plain.token_topic(token), "zenoh", -1] += 1
     return sorted(FoundTopic(*which, n) for which, n in found.items())
-
-
-def _tokens(session: zenoh.Session, expression: str, seconds: float) -> list[str]:
-    replies = session.liveliness().get(expression, timeout=seconds)
-    return [str(reply.ok.key_expr) for reply in replies if reply.ok]
