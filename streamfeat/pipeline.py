@@ -166,8 +166,12 @@ class Pipeline(Generic[In, Out]):
             more = group is not None
             emissions = self._emissions(group)
             # One packet can give as many emissions as it has events: they are handed on in parts.
-            while part := await loop.run_in_executor(threads, _take, emissions):
-                await self._outbox.put(part)
+            full = True
+            while full:
+                part = await loop.run_in_executor(threads, _take, emissions)
+                if part:
+                    await self._outbox.put(part)
+                full = len(part) == _EMISSIONS_A_HOP
         await self._outbox.put(None)
 
     def _emissions(self, group: list[In] | None) -> Iterator[Out]:
