@@ -24,7 +24,8 @@ def test_in_order_nothing_is_wrong():
 
 
 def test_who_joins_late_has_lost_nothing():
-    assert feed([5_000, 5_001])[0].stats == DeliveryStats(received=2)
+    assert feed([5_000, 5_001])[0].stats == DeliveryStats(received=2, unheard=4_999)
+    assert feed([5_000, 5_001], gid=b"")[0].stats == DeliveryStats(received=2)
 
 
 def test_a_gap_is_lost_and_breaks_decoders():

@@ -262,7 +262,7 @@ def at_rate(arguments: argparse.Namespace, rate: float, seconds: float, emit: st
     rng = np.random.default_rng(0)
     size, ready = 4096, []
     writer = PacketWriter()
-    events = np.concatenate(camera_packets(arguments.recording, 5))[: 64 * size]
+    events = np.concatenate(camera_packets(arguments.recording, 5))
     step_us = max(int(size / rate * 1e6), 1)
     with (
         open_session(port=arguments.port) as session,
@@ -272,7 +272,7 @@ def at_rate(arguments: argparse.Namespace, rate: float, seconds: float, emit: st
         camera = MessagePublisher(session, PlainNames(KEY), KEY, EventPacket.SCHEMA_NAME)
         wait_for_reader(session, KEY)
         # The same pixels again and again, at the times of this rate; encoding is not what is measured.
-        for i in range(64):
+        for i in range(min(len(events) // size, 64)):
             batch = events[i * size : (i + 1) * size].copy()
             batch["t"] = np.sort(rng.integers(0, step_us, len(batch)))
             (message,) = writer.messages(batch, FRAME)
@@ -283,7 +283,7 @@ def at_rate(arguments: argparse.Namespace, rate: float, seconds: float, emit: st
             if n >= due:
                 time.sleep(0.0005)
                 continue
-            message = ready[n % 64]
+            message = ready[n % len(ready)]
             stamp = n * step_us * 1000
             fresh = EventPacket(stamp, "", *FRAME, n, stamp, message.encoding, False, message.events)
             camera.put(fresh.to_cdr())
@@ -365,10 +365,22 @@ def steady(reader: Reader, timeout: float = 90.0) -> None:
 
 
 def accounted(published: int | None, result: dict[str, Any]) -> dict[str, Any]:
-    known = {name: result[name] for name in ("packets", "lost", "dropped", "duplicates", "foreign", "restarts", "incomplete")}
+    known = {
+        name: result[name]
+        for name in (
+            "packets",
+            "unheard",
+            "lost",
+            "dropped",
+            "duplicates",
+            "foreign",
+            "restarts",
+            "incomplete",
+        )
+    }
     if published is None:
         return known
-    missing = published - result["packets"] - result["lost"] - result["dropped"]
+    missing = published - sum(result[name] for name in ("packets", "unheard", "lost", "dropped"))
     return {"published": published, "unaccounted": missing} | known
 
 

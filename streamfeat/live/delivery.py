@@ -26,6 +26,8 @@ class DeliveryStats:
     Attributes:
         received: packets that arrived and were used.
         lost: numbers that never arrived.
+        unheard: numbers before the first packet that reached us: its publisher, or its link to us, was there
+            before we were, or late.
         dropped: packets that arrived and were dropped because nobody had time for them.
         duplicates: packets that had arrived before.
         reordered: packets that arrived after one with a higher number.
@@ -35,6 +37,7 @@ class DeliveryStats:
 
     received: int = 0
     lost: int = 0
+    unheard: int = 0
     dropped: int = 0
     duplicates: int = 0
     reordered: int = 0
@@ -129,6 +132,7 @@ class Delivery:
         self._old.clear()
         self.stats.received += 1
         self.stats.lost += lost
+        self.stats.unheard += max(seq - 1, 0) if first and gid else 0
         self.stats.restarts += not first
         return Verdict(use=True, lost=lost + dropped, broken=not first, restarted=not first)
 

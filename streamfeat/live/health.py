@@ -129,6 +129,7 @@ class Health:
             ("incomplete_emissions", stats.incomplete, "Readings of windows that packets are missing from"),
             ("packets", delivery.received, "Packets used"),
             ("lost_packets", delivery.lost, "Packets that never arrived: gaps in their numbers"),
+            ("unheard_packets", delivery.unheard, "Numbers before the first packet of a camera"),
             ("dropped_packets", self._inbox.dropped, "Packets dropped because ingest could not keep up"),
             ("duplicate_packets", delivery.duplicates, "Packets that had arrived before"),
             ("reordered_packets", delivery.reordered, "Packets that arrived late"),
@@ -167,6 +168,7 @@ class Health:
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         result |= {
             "lost": delivery.lost,
+            "unheard": delivery.unheard,
             "dropped": self._inbox.dropped,
             "duplicates": delivery.duplicates,
             "reordered": delivery.reordered,

@@ -123,6 +123,7 @@ class Record:
             "bytes": self._bytes,
             "seconds": round(self._seconds, 3),
             "lost": delivery.lost,
+            "unheard": delivery.unheard,
             "dropped": self._inbox.dropped,
             "duplicates": delivery.duplicates,
             "restarts": delivery.restarts,
