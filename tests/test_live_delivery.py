@@ -64,9 +64,11 @@ def test_counts_are_true_for_any_order(seed):
 def test_what_we_dropped_is_not_lost_on_the_way():
     delivery = Delivery()
     delivery.see(ONE, 1, 0)
+    assert delivery.see(ONE, 1, 1) == (False, 0, False, False, False)
+    assert delivery.see(TWO, 1, 1) == (False, 0, False, False, True)
     verdict = delivery.see(ONE, 10, 1, dropped=5)
     assert (verdict.lost, verdict.broken) == (8, True)
-    assert delivery.stats == DeliveryStats(received=2, lost=3, dropped=5)
+    assert delivery.stats == DeliveryStats(received=2, lost=3, dropped=5, duplicates=1, foreign=1)
 
 
 def test_a_publisher_that_restarts_is_followed():

@@ -57,12 +57,14 @@ class Verdict(NamedTuple):
         lost: packets missing right before it.
         broken: it does not follow the one before, so a decoder cannot rely on what it remembers.
         restarted: its publisher is new or counts anew.
+        foreign: it is of a second publisher.
     """
 
     use: bool
     lost: int = 0
     broken: bool = False
     restarted: bool = False
+    foreign: bool = False
 
 
 class Delivery:
@@ -91,7 +93,7 @@ class Delivery:
         if self._gid is not None and gid != self._gid and now_ns - self._heard_ns < _SILENCE_NS:
             self._other = gid
             self.stats.foreign += 1
-            return Verdict(use=False, lost=dropped)
+            return Verdict(use=False, lost=dropped, foreign=True)
         if gid != self._gid or self._counts_anew(seq):
             return self._take_over(gid, seq, now_ns, dropped)
         self._heard_ns = now_ns

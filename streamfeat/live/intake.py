@@ -160,6 +160,7 @@ class Intake:
         state = self.topics.get(topic)
         if state:
             state.delivery.left()
+            state.reader = PacketReader(topic, MAX_PACKET_EVENTS)
             state.clock = CameraClock(self._window_us)
             state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
 
@@ -217,15 +218,15 @@ class Intake:
             state.reader.resync()
         if verdict.restarted:
             self._warnings.add("publisher restarted", message.topic, f"now {numbered.gid.hex() or 'unnamed'}")
+        state.lost += verdict.lost
+        if verdict.foreign:
+            self._warnings.add("second publisher", message.topic, numbered.gid.hex() or "unnamed")
         if not verdict.use:
-            if state.delivery.stats.foreign and numbered.gid:
-                self._warnings.add("second publisher", message.topic, numbered.gid.hex())
             return
         if verdict.lost:
             self._warnings.add(
                 "packets missing", message.topic, f"{verdict.lost} before number {numbered.seq}"
             )
-        state.lost += verdict.lost
         try:
             packet = self._placed(state, message, numbered)
         except _RefusalError:
