@@ -31,7 +31,8 @@ class Emission:
         final: this is the reading at the end of that sample, the one that counts.
         topic: of the camera, where there may be several.
         incomplete: packets are known to be missing from the window.
-        source_ns: when the latest packet that went in was published, by its publisher's clock; 0 if unknown.
+        source_ns: when the packet that brought about this reading was published, by its publisher's clock; 0
+            if that is unknown, or silence brought it about.
     """
 
     t_us: int

@@ -129,6 +129,7 @@ class Session:
     def process(self, item: StreamItem) -> Iterator[Emission]:
         """Take in one item of the stream, and yield what is read on the way."""
         if isinstance(item, Tick):
+            self._source_ns = 0
             yield from self._pass_time(item.t_us)
             return
         if isinstance(item, Label):
@@ -169,6 +170,7 @@ class Session:
 
     def finish(self) -> Iterator[Emission]:
         """End the stream: the open sample is read, and what was collected is learned."""
+        self._source_ns = 0
         yield from self._finish_sample()
         if self._unread and self._engine:
             yield self._read(self._engine, self._last_us + 1)

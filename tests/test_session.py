@@ -402,8 +402,11 @@ def run_live(items, policy, **options):
 @pytest.mark.parametrize("policy", ["10ms", "7ev", "event", "auto"])
 def test_ticks_read_what_decays_and_then_nothing(policy):
     batch = tiny.steady(10_000, 20_000, 50)
+    packet = replace(tiny.packet(batch), source_ns=7)
     ticks = [Tick("", t) for t in range(20_000, 5 * WINDOW, 3_000)]
-    emissions, session = run_live([tiny.packet(batch), *ticks], policy)
+    emissions, session = run_live([packet, *ticks], policy)
+    of_events = len(run_live([packet], policy)[0])
+    assert [e.source_ns for e in emissions] == [7] * of_events + [0] * (len(emissions) - of_events)
     every = 10_000 if policy == "10ms" else tiny.GEOMETRY.bin_us
     silent = [e for e in emissions if e.t_us > 20_000]
     assert (
