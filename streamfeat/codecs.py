@@ -55,9 +55,13 @@ class Decoder(Protocol):
 class MonoDecoder:
     """`mono`: u64 words of `dt` ns (32 bits), x (16), y (15) and polarity (1)."""
 
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Refuse packets of more events than this."""
+        self._max_events = max_events
+
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
-        words = _records(payload, np.dtype("<u8"), "mono")
+        words = _records(payload, np.dtype("<u8"), "mono", self._max_events)
         dt_ns = (words & 0xFFFFFFFF).astype(np.int64)
         # time_base may use all 64 bits, so the sum is taken apart instead of overflowing
         t = time_base_ns // 1000 + (time_base_ns % 1000 + dt_ns) // 1000
@@ -70,9 +74,13 @@ class MonoDecoder:
 class LibcaerDecoder:
     """`libcaer`: u32 address and polarity, then u32 microseconds that wrap at 31 bits within a packet."""
 
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Refuse packets of more events than this."""
+        self._max_events = max_events
+
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
-        records = _records(payload, _LIBCAER, "libcaer")
+        records = _records(payload, _LIBCAER, "libcaer", self._max_events)
         data = records["data"]
         us = (records["us"] & (_LIBCAER_WRAP_US - 1)).astype(np.int64)
         # Only a fall of more than half the range is a wrap: a smaller one is an event out of order.
@@ -87,14 +95,15 @@ class LibcaerDecoder:
 class LibcaerCmpDecoder:
     """`libcaer_cmp`: u16 words, addresses carried over from the packet before."""
 
-    def __init__(self) -> None:
-        """Start with no address known."""
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Start with no address known; refuse packets of more events than this."""
+        self._max_events = max_events
         self._state = np.zeros(3, np.int64)
 
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "libcaer_cmp")
-        out = _room_for(words, 3, {5: 8}, "libcaer_cmp")
+        out = _room_for(words, 3, {5: 8}, "libcaer_cmp", self._max_events)
         n = decode_libcaer_cmp(words, time_base_ns // 1000, self._state, out)
         if n < 0:
             at = -1 - n
@@ -112,14 +121,15 @@ class Evt3Decoder:
     not used. Events before the first TIME_HIGH, TIME_LOW and ADDR_Y, in this order, are skipped.
     """
 
-    def __init__(self) -> None:
-        """Start with nothing seen."""
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Start with nothing seen; refuse packets of more events than this."""
+        self._max_events = max_events
         self._state = np.zeros(6, np.int64)
 
     def decode(self, payload: bytes | memoryview, time_base_ns: int = 0) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "evt3")
-        out = _room_for(words, 0x2, {0x4: 12, 0x5: 8}, "evt3")
+        out = _room_for(words, 0x2, {0x4: 12, 0x5: 8}, "evt3", self._max_events)
         return out[: decode_evt3(words, self._state, out)]
 
     def resync(self) -> None:
@@ -127,7 +137,7 @@ class Evt3Decoder:
         self._state[-1] = 0
 
 
-_DECODERS: dict[str, Callable[[], Decoder]] = {
+_DECODERS: dict[str, Callable[[int], Decoder]] = {
     "mono": MonoDecoder,
     "libcaer": LibcaerDecoder,
     "libcaer_cmp": LibcaerCmpDecoder,
@@ -138,15 +148,15 @@ ENCODINGS = tuple(_DECODERS)
 """The names that `make_decoder` and `encode` take."""
 
 
-def make_decoder(encoding: str) -> Decoder:
-    """Make the decoder of one topic.
+def make_decoder(encoding: str, max_events: int = MAX_PACKET_EVENTS) -> Decoder:
+    """Make the decoder of one topic, which refuses packets of more than `max_events` events.
 
     Raises:
         InputError: the encoding is none of `ENCODINGS`.
     """
     if encoding not in _DECODERS:
         raise InputError(f"unknown event encoding {encoding[:40]!r}; known are {', '.join(ENCODINGS)}")
-    return _DECODERS[encoding]()
+    return _DECODERS[encoding](max_events)
 
 
 def encode(events: Events, encoding: str, after_us: int = 0) -> tuple[bytes, int]:
@@ -193,7 +203,9 @@ def encode(events: Events, encoding: str, after_us: int = 0) -> tuple[bytes, int
 _Record = TypeVar("_Record", bound=np.generic)
 
 
-def _records(payload: bytes | memoryview, dtype: np.dtype[_Record], encoding: str) -> NDArray[_Record]:
+def _records(
+    payload: bytes | memoryview, dtype: np.dtype[_Record], encoding: str, limit: int
+) -> NDArray[_Record]:
     """View a payload as whole records."""
     if len(payload) % dtype.itemsize:
         raise InputError(
@@ -201,16 +213,16 @@ def _records(payload: bytes | memoryview, dtype: np.dtype[_Record], encoding: st
             "the packet is cut short or of another encoding"
         )
     records = np.frombuffer(payload, dtype)
-    _check_count(len(records), MAX_PACKET_EVENTS, encoding)
+    _check_count(len(records), limit, encoding)
     return records
 
 
 def _words(payload: bytes | memoryview, encoding: str) -> _Words:
     """Copy a payload out, so that a kernel meets one array type, whatever address the bytes had."""
-    return _records(payload, np.dtype(np.uint16), encoding).copy()
+    return _records(payload, np.dtype(np.uint16), encoding, MAX_PACKET_EVENTS).copy()
 
 
-def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str) -> Events:
+def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str, limit: int) -> Events:
     """Allocate for all events that these words can hold.
 
     Args:
@@ -218,12 +230,13 @@ def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str
         single: the type that is one event.
         vectors: the types that are one event per set bit, with how many bits count.
         encoding: named in the error.
+        limit: how many are too many.
     """
     kind = words >> 12
     n = int(np.count_nonzero(kind == single))
     for code, width in vectors.items():
         n += int(np.bitwise_count(words[kind == code] & ((1 << width) - 1)).sum(dtype=np.int64))
-    _check_count(n, MAX_PACKET_EVENTS, encoding)
+    _check_count(n, limit, encoding)
     return np.zeros(n, EVENT_DTYPE)
 
 

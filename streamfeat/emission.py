@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.recording import Label
+from streamfeat.packets import Label
 
 __all__ = ["Emission", "EmitPolicy"]
 
@@ -29,6 +29,10 @@ class Emission:
         scores: `(C,)` float32.
         sample: the labelled sample that is open, if any.
         final: this is the reading at the end of that sample, the one that counts.
+        topic: of the camera, where there may be several.
+        incomplete: packets are known to be missing from the window.
+        source_ns: when the packet that brought about this reading was published, by its publisher's clock; 0
+            if that is unknown, or silence brought it about.
     """
 
     t_us: int
@@ -38,6 +42,9 @@ class Emission:
     scores: NDArray[np.float32]
     sample: Label | None
     final: bool
+    topic: str = ""
+    incomplete: bool = False
+    source_ns: int = 0
 
     @property
     def prediction(self) -> str | None:

@@ -297,15 +297,19 @@ class LabelMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeaturesMessage:
-    """Features at `stamp_ns`, after `n_events` events; `data` is `(n,)` float32."""
+    """Features at `stamp_ns`, after `n_events` events; `data` is `(n,)` float32.
+
+    `incomplete` says that packets are known to be missing from the window.
+    """
 
     stamp_ns: int
     frame_id: str
     n_events: int
     data: NDArray[np.float32]
+    incomplete: bool = False
 
     SCHEMA_NAME: ClassVar[str] = "streamfeat_msgs/msg/Features"
-    SCHEMA: ClassVar[str] = _schema("uint64 n_events\nfloat32[] data\n")
+    SCHEMA: ClassVar[str] = _schema("uint64 n_events\nfloat32[] data\nbool incomplete\n")
 
     @classmethod
     def from_cdr(cls, data: bytes | memoryview) -> Self:
@@ -317,7 +321,8 @@ class FeaturesMessage:
         r = _Reader(data, "Features")
         stamp_ns, frame_id = r.stamp_and_frame()
         n_events = r.number("Q", "n_events")
-        return cls(stamp_ns, frame_id, n_events, np.frombuffer(r.sequence(4, "data"), "<f4"))
+        values = np.frombuffer(r.sequence(4, "data"), "<f4")
+        return cls(stamp_ns, frame_id, n_events, values, bool(r.number("B", "incomplete")))
 
     def to_cdr(self) -> bytes:
         """Write the message.
@@ -326,7 +331,8 @@ class FeaturesMessage:
             InputError: the stamp is out of range.
         """
         w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id).number("Q", self.n_events)
-        return w.number("I", len(self.data)).raw(self.data.astype("<f4").tobytes()).bytes()
+        w.number("I", len(self.data)).raw(self.data.astype("<f4").tobytes())
+        return w.number("B", self.incomplete).bytes()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

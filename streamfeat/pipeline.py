@@ -1,17 +1,19 @@
-"""The asynchronous pipeline: source, session and sinks, joined by bounded queues.
+"""The asynchronous pipeline: source, processor and sinks, joined by bounded queues.
 
 Lives here: every task and queue of the package, pacing, and ending well.
-Not here: what is computed (`session`), read (`recording`) or written (`sinks`).
+Not here: what is computed (`session`, `cameras`), read (`recording`, `live`) or written (`sinks`).
 
 Three tasks: one reads and decodes, one runs the kernels, one writes. Blocking work happens in a thread of
 each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full, whoever
-fills it waits, so a replay loses nothing and needs no more memory than a few packets.
+fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live source cannot
+make a camera wait: it has an inbox of its own, which says what it does when it is full (`live.inbox`).
 
 Ending: when the source is exhausted or `stop` is set, what is in the queues is processed and the sinks are
 closed. When a task fails, the others are cancelled and the sinks are closed as failed.
 """
 
 import asyncio
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,18 +21,21 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from threading import current_thread, main_thread
 from types import TracebackType
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from streamfeat.emission import Emission
-from streamfeat.recording import Label, Packet
-from streamfeat.session import Session
+from streamfeat.packets import Label, Packet
 from streamfeat.sinks import Sink
 
-__all__ = ["Pipeline", "PipelineStats"]
+__all__ = ["Pipeline", "PipelineStats", "Processor", "run_until_interrupted"]
 
-Item = Packet | Label
+In = TypeVar("In")
+Out = TypeVar("Out")
+Taken = TypeVar("Taken", contravariant=True)
+Made = TypeVar("Made", covariant=True)
 
 _QUEUE_ITEMS = 8
 _EVENTS_A_HOP = 32_768
@@ -46,7 +51,7 @@ class PipelineStats:
 
     Attributes:
         items: items read from the source.
-        queued_in: groups of items that wait for the session, at most 8.
+        queued_in: groups of items that wait for the processor, at most 8.
         queued_out: groups of emissions that wait for the sinks, at most 8.
         dropped: items dropped; always 0, a full queue makes its producer wait.
         stopped: the source was stopped before its end.
@@ -59,12 +64,23 @@ class PipelineStats:
     stopped: bool = False
 
 
-class Pipeline:
-    """Runs the items of a recording through a session into sinks.
+class Processor(Protocol[Taken, Made]):
+    """Makes something of each item; runs in a thread, one item at a time."""
+
+    def process(self, item: Taken, /) -> Iterator[Made]:
+        """Take in one item, and yield what comes of it."""
+
+    def finish(self) -> Iterator[Made]:
+        """The items have ended: yield what is left."""
+
+
+class Pipeline(Generic[In, Out]):
+    """Runs items through a processor into sinks.
 
     Args:
-        items: packets and labels in stream order; iterated in a thread of its own.
-        session: what is done with them.
+        items: in stream order; iterated in a thread of its own. None says that nothing more is there at the
+            moment, so that what is need not wait.
+        processor: what is done with them: a `Session`, for one.
         sinks: written to in this order.
         speed: stream seconds for each second of the clock; None for as fast as possible.
         on_progress: called on the event loop's thread after each group, with stream time in microseconds.
@@ -72,21 +88,21 @@ class Pipeline:
 
     def __init__(
         self,
-        items: Iterable[Item],
-        session: Session,
-        sinks: Sequence[Sink],
+        items: Iterable[In | None],
+        processor: Processor[In, Out],
+        sinks: Sequence[Sink[Out]],
         *,
         speed: float | None = None,
         on_progress: Callable[[int], None] = lambda t_us: None,
     ) -> None:
         """Nothing runs before `run`."""
         self._items = items
-        self._session = session
+        self._processor = processor
         self._sinks = sinks
         self._speed = speed
         self._on_progress = on_progress
-        self._inbox: asyncio.Queue[list[Item] | None] = asyncio.Queue(_QUEUE_ITEMS)
-        self._outbox: asyncio.Queue[list[Emission] | None] = asyncio.Queue(_QUEUE_ITEMS)
+        self._inbox: asyncio.Queue[list[In] | None] = asyncio.Queue(_QUEUE_ITEMS)
+        self._outbox: asyncio.Queue[list[Out] | None] = asyncio.Queue(_QUEUE_ITEMS)
         self._stop = asyncio.Event()
         self._stats = PipelineStats()
 
@@ -150,16 +166,20 @@ class Pipeline:
             more = group is not None
             emissions = self._emissions(group)
             # One packet can give as many emissions as it has events: they are handed on in parts.
-            while part := await loop.run_in_executor(threads, _take, emissions):
-                await self._outbox.put(part)
+            full = True
+            while full:
+                part = await loop.run_in_executor(threads, _take, emissions)
+                if part:
+                    await self._outbox.put(part)
+                full = len(part) == _EMISSIONS_A_HOP
         await self._outbox.put(None)
 
-    def _emissions(self, group: list[Item] | None) -> Iterator[Emission]:
+    def _emissions(self, group: list[In] | None) -> Iterator[Out]:
         if group is None:
-            yield from self._session.finish()
+            yield from self._processor.finish()
         else:
             for item in group:
-                yield from self._session.process(item)
+                yield from self._processor.process(item)
 
     async def _write(self, threads: ThreadPoolExecutor) -> None:
         loop = asyncio.get_running_loop()
@@ -168,32 +188,81 @@ class Pipeline:
                 await loop.run_in_executor(threads, sink.write, part)
 
 
+def run_until_interrupted(
+    pipelines: Sequence[Pipeline[In, Out]], interrupt: Callable[[], None] | None = None
+) -> bool:
+    """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
+
+    Args:
+        pipelines: none of which has run.
+        interrupt: what a signal does; if not given, it stops every pipeline.
+
+    Returns:
+        whether there was a signal.
+    """
+    interrupted = False
+
+    def on_signal() -> None:
+        nonlocal interrupted
+        interrupted = True
+        if interrupt:
+            interrupt()
+        else:
+            for pipeline in pipelines:
+                pipeline.stop()
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        # Only the main thread of a process can be told of signals.
+        names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+        for name in names:
+            loop.add_signal_handler(name, on_signal)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                for pipeline in pipelines:
+                    tasks.create_task(pipeline.run())
+        except BaseExceptionGroup as group:
+            raise group.exceptions[0] from None
+        finally:
+            for name in names:
+                loop.remove_signal_handler(name)
+
+    asyncio.run(run())
+    return interrupted
+
+
 def _close(
-    sink: Sink, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    sink: Sink[Out],
+    kind: type[BaseException] | None,
+    value: BaseException | None,
+    trace: TracebackType | None,
 ) -> None:
     sink.close(failed=kind is not None)
 
 
-def _take(emissions: Iterator[Emission]) -> list[Emission]:
+def _take(emissions: Iterator[Out]) -> list[Out]:
     return list(islice(emissions, _EMISSIONS_A_HOP))
 
 
-def _full_groups(items: Iterable[Item]) -> Iterator[list[Item]]:
-    group: list[Item] = []
+def _full_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
+    group: list[In] = []
     events = 0
     for item in items:
-        group.append(item)
-        events += len(item.events) if isinstance(item, Packet) else 0
-        if events >= _EVENTS_A_HOP:
+        if item is not None:
+            group.append(item)
+            events += len(item.events) if isinstance(item, Packet) else 0
+        if events >= _EVENTS_A_HOP or (item is None and group):
             yield group
             group, events = [], 0
     if group:
         yield group
 
 
-def _paced_groups(items: Iterable[Item]) -> Iterator[list[Item]]:
+def _paced_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
     for item in items:
-        if isinstance(item, Label) or len(item.events) == 0:
+        if item is None:
+            continue
+        if not isinstance(item, Packet) or len(item.events) == 0:
             yield [item]
             continue
         latest = np.maximum.accumulate(item.events["t"])
@@ -204,9 +273,9 @@ def _paced_groups(items: Iterable[Item]) -> Iterator[list[Item]]:
             start = stop
 
 
-def _stream_time(group: list[Item]) -> int | None:
+def _stream_time(group: Sequence[object]) -> int | None:
     """The time by which a group is complete: that of its latest event."""
     last = group[-1]
     if isinstance(last, Label):
         return last.start_us
-    return int(last.events["t"].max()) if len(last.events) else None
+    return int(last.events["t"].max()) if isinstance(last, Packet) and len(last.events) else None

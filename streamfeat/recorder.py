@@ -16,17 +16,13 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
-from streamfeat.codecs import encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
-from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.recording import Label
+from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.packets import Label, PacketWriter
 
 __all__ = ["RecordingWriter", "recover"]
-
-PACKET_EVENTS = 8192
-PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
 
 _COMPRESSION = {
     "zstd": CompressionType.ZSTD,
@@ -98,16 +94,14 @@ class RecordingWriter:
         Raises:
             InputError: the encoding or compression is unknown, or the file exists or cannot be written.
         """
-        make_decoder(encoding)
         if compression not in _COMPRESSION:
             raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + part_suffix)
         self._overwrite, self._keep_partial = overwrite, keep_partial
-        self._encoding, self._event_topic, self._frame_id = encoding, event_topic, frame_id
+        self._event_topic, self._frame_id = event_topic, frame_id
+        self._packets = PacketWriter(encoding, frame_id)
         self._channels: dict[str | int, int] = {}
-        self._seq = 0
-        self._after_us = 0
         self._check_target()
         try:
             self._file = self._part.open("xb")
@@ -169,15 +163,10 @@ class RecordingWriter:
             InputError: the encoding cannot represent the events (see `streamfeat.codecs.encode`), or a
                 time is negative or 2^31 s or more.
         """
-        start = 0
-        while start < len(events):
-            block = events[start : start + PACKET_EVENTS]
-            far = np.flatnonzero(np.abs(block["t"] - block["t"][0]) >= PACKET_US)
-            block = block[: far[0]] if len(far) else block
-            self._write_packet(block, resolution)
-            start += len(block)
+        for packet in self._packets.messages(events, resolution):
+            self._write(self._event_topic, packet)
 
-    def write_label(self, label: Label) -> None:
+    def write_label(self, label: Label, topic: str = "/label") -> None:
         """Write a label; do so before the events it speaks of.
 
         Raises:
@@ -191,23 +180,29 @@ class RecordingWriter:
             label.split,
             label.source,
         )
-        self._write("/label", message)
+        self._write(topic, message)
 
-    def write_features(self, t_us: int, n_events: int, data: ArrayLike) -> None:
+    def write_features(
+        self, t_us: int, n_events: int, data: ArrayLike, *, incomplete: bool = False, topic: str = "/features"
+    ) -> None:
         """Write the features at a stream time.
 
         Args:
             t_us: stream time, microseconds.
             n_events: events that went into them.
             data: `(n,)`, stored as float32, not changed.
+            incomplete: packets are known to be missing from the window.
+            topic: to write to.
 
         Raises:
             InputError: the time is out of range.
         """
         values = np.asarray(data, np.float32)
-        self._write("/features", FeaturesMessage(t_us * 1000, self._frame_id, n_events, values))
+        self._write(topic, FeaturesMessage(t_us * 1000, self._frame_id, n_events, values, incomplete))
 
-    def write_prediction(self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike) -> None:
+    def write_prediction(
+        self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike, *, topic: str = "/prediction"
+    ) -> None:
         """Write a prediction at a stream time.
 
         Args:
@@ -215,37 +210,38 @@ class RecordingWriter:
             label: the winner.
             labels: all labels.
             scores: `(len(labels),)`, stored as float32, not changed.
+            topic: to write to.
 
         Raises:
             InputError: the time is out of range.
         """
         values = np.asarray(scores, np.float32)
-        self._write("/prediction", PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
+        self._write(topic, PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
 
-    def _write_packet(self, events: Events, resolution: Resolution) -> None:
-        payload, time_base_ns = encode(events, self._encoding, self._after_us)
-        height, width = resolution
-        packet = EventPacket(
-            int(events["t"].min()) * 1000,
-            self._frame_id,
-            height,
-            width,
-            self._seq,
-            time_base_ns,
-            self._encoding,
-            False,
-            payload,
-        )
-        self._write(self._event_topic, packet)
-        self._seq += 1
-        self._after_us = int(events["t"][-1])
+    def write_message(
+        self, topic: str, kind: type[_Message | EventArray], data: bytes, log_time_ns: int, sequence: int
+    ) -> None:
+        """Write a message as it came.
+
+        Args:
+            topic: to write to.
+            kind: its type; that the bytes are of it is not checked.
+            data: the CDR bytes.
+            log_time_ns: when it came, since 1970.
+            sequence: its number, 32 bits.
+        """
+        self._add(self._channel(topic, kind), log_time_ns, data, log_time_ns, sequence)
 
     def _write(self, topic: str, message: _Message) -> None:
         data = message.to_cdr()
-        if topic not in self._channels:
-            schema = self._writer.register_schema(message.SCHEMA_NAME, "ros2msg", message.SCHEMA.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        self._add(self._channels[topic], message.stamp_ns, data, message.stamp_ns, 0)
+        self._add(self._channel(topic, type(message)), message.stamp_ns, data, message.stamp_ns, 0)
+
+    def _channel(self, topic: str, kind: type[_Message | EventArray]) -> int:
+        which = f"{topic} {kind.SCHEMA_NAME}"
+        if which not in self._channels:
+            schema = self._writer.register_schema(kind.SCHEMA_NAME, "ros2msg", kind.SCHEMA.encode())
+            self._channels[which] = self._writer.register_channel(topic, "cdr", schema)
+        return self._channels[which]
 
     def _copy(self, channel: Channel, schema: Schema, message: Message) -> None:
         """Write a message of another recording as it is; do not mix with the public ways to write."""

@@ -1,7 +1,8 @@
 """Reading recordings: batches, packets, labels and labelled samples out of an MCAP file.
 
 Lives here: `open_recording` and what it gives; choosing the topic, decoding, counting.
-Not here: the file format and its damage (`streamfeat.mcap_records`), writing (`streamfeat.recorder`).
+Not here: the file format and its damage (`streamfeat.mcap_records`), messages (`streamfeat.packets`), writing
+(`streamfeat.recorder`).
 
 A recording is read in file order with one packet in memory at a time. What cannot be read is skipped and
 counted in `Recording.losses`; only a recording that yields nothing at all is an error.
@@ -17,21 +18,27 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 import numpy as np
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Schema
 
-from streamfeat.codecs import Decoder, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.mcap_records import Losses, Summary, iter_messages, iter_records, open_mcap, read_summary
-from streamfeat.messages import EventArray, EventPacket, LabelMessage
+from streamfeat.messages import LabelMessage
+from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader
 
-__all__ = ["HELD_OUT_SPLITS", "Label", "Losses", "Packet", "Recording", "Sample", "Topic", "open_recording"]
+__all__ = [
+    "HELD_OUT_SPLITS",
+    "Label",
+    "Losses",
+    "Packet",
+    "Recording",
+    "Sample",
+    "Topic",
+    "open_recording",
+]
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
-
-_EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
-_MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,28 +49,6 @@ class Topic:
     schema: str
     schema_encoding: str
     n_messages: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Packet:
-    """One message of events; `log_time_ns` is when it was recorded, `seq` its number at the source."""
-
-    topic: str
-    events: Events
-    resolution: Resolution
-    log_time_ns: int
-    seq: int
-
-
-@dataclass(frozen=True, slots=True)
-class Label:
-    """A labelled sample: the events in `[start_us, start_us + duration_us)`."""
-
-    start_us: int
-    duration_us: int
-    label: str
-    split: str = ""
-    source: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +140,7 @@ class Recording:
             self._known = summary or _scan(self._file)
             self.topics = _topics(self._known)
             self.topic = _choose_topic(
-                self.path, [t for t in self.topics if t.schema in _EVENT_SCHEMAS], topic
+                self.path, [t for t in self.topics if t.schema in EVENT_SCHEMAS], topic
             )
             self.encoding = ""
             self.resolution = self._first_packet().resolution
@@ -187,27 +172,20 @@ class Recording:
     def items(self) -> Iterator[Packet | Label]:
         """Yield packets and labels in stored order; a label comes before its first packet."""
         losses = self.losses = Losses()
-        decoders: dict[str, Decoder] = {}
+        reader = PacketReader(self.topic)
         seen: Counter[int] = Counter()
-        last_seq: int | None = None
         for at, channel, schema, message in iter_messages(self._file, self._known, losses):
             is_label = schema.name == LabelMessage.SCHEMA_NAME
-            if not is_label and (channel.topic != self.topic or schema.name not in _EVENT_SCHEMAS):
+            if not is_label and (channel.topic != self.topic or schema.name not in EVENT_SCHEMAS):
                 continue
             seen[channel.id] += 1
             item: Packet | Label
             try:
                 if is_label:
-                    item = _read_label(message.data)
-                elif schema.name == EventArray.SCHEMA_NAME:
-                    item = self._read_array(message)
+                    item = Label.from_cdr(message.data)
                 else:
-                    packet = EventPacket.from_cdr(message.data)
-                    if last_seq is not None and packet.seq > last_seq + 1:
-                        for decoder in decoders.values():
-                            decoder.resync()
-                    last_seq = packet.seq
-                    item = self._read_packet(packet, message, decoders)
+                    item = reader.read(schema.name, message.data, message.log_time, message.sequence)
+                    self.encoding = self.encoding or reader.encoding
             except InputError as error:
                 where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
                 losses.add("bad label" if is_label else "bad packet", len(message.data), where)
@@ -286,22 +264,6 @@ class Recording:
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
 
-    def _read_packet(self, packet: EventPacket, message: Message, decoders: dict[str, Decoder]) -> Packet:
-        if packet.is_bigendian:
-            raise InputError("big-endian payloads are not supported; record with is_bigendian false")
-        if packet.encoding not in decoders:
-            decoders[packet.encoding] = make_decoder(packet.encoding)
-        events = decoders[packet.encoding].decode(packet.events, packet.time_base)
-        resolution = _resolution(packet.height, packet.width)
-        self.encoding = self.encoding or packet.encoding
-        return Packet(self.topic, events, resolution, message.log_time, packet.seq)
-
-    def _read_array(self, message: Message) -> Packet:
-        array = EventArray.from_cdr(message.data)
-        resolution = _resolution(array.height, array.width)
-        self.encoding = self.encoding or "dvs_msgs"
-        return Packet(self.topic, array.events, resolution, message.log_time, message.sequence)
-
     def _count_missing(self, channel_id: int, seen: int, losses: Losses) -> None:
         channel = self._known.channels.get(channel_id)
         missing = self._expected.get(channel_id, 0) - seen
@@ -337,25 +299,14 @@ def _topics(known: Summary) -> list[Topic]:
 
 
 def _choose_topic(path: Path, topics: list[Topic], wanted: str | None) -> str:
-    names = sorted({t.name for t in topics if t.schema in _EVENT_SCHEMAS})
+    names = sorted({t.name for t in topics if t.schema in EVENT_SCHEMAS})
     if not names:
-        raise InputError(f"{path}: no topic carries {' or '.join(_EVENT_SCHEMAS)}; is this the right file?")
+        raise InputError(f"{path}: no topic carries {' or '.join(EVENT_SCHEMAS)}; is this the right file?")
     if wanted is None and len(names) > 1:
         raise InputError(f"{path}: several topics carry events, choose one of {names}")
     if wanted is not None and wanted not in names:
         raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
     return wanted or names[0]
-
-
-def _resolution(height: int, width: int) -> Resolution:
-    if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE):
-        raise InputError(f"a sensor of height {height} and width {width} is not possible")
-    return height, width
-
-
-def _read_label(data: bytes) -> Label:
-    m = LabelMessage.from_cdr(data)
-    return Label(m.stamp_ns // 1000, m.duration_ns // 1000, m.label, m.split, m.source)
 
 
 def _start_us(packet: Packet) -> int | None:

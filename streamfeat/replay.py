@@ -4,28 +4,26 @@ Lives here: opening what a replay needs, running the pipeline until it ends or i
 Not here: how it is computed (`session`, `pipeline`), how it looks (`sinks`, `cli`).
 """
 
-import asyncio
-import contextlib
-import signal
 import time
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
 
 from streamfeat.classifier import Classifier
-from streamfeat.emission import EmitPolicy
+from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.mcap_records import Losses
-from streamfeat.pipeline import Pipeline
+from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, Packet, Recording, open_recording
+from streamfeat.recording import Label, Packet, open_recording
 from streamfeat.session import Session
-from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink
+from streamfeat.sinks import JsonLinesSink, RecordingSink, TerminalSink, open_sinks
 
-__all__ = ["Replay", "items_of_split"]
+__all__ = ["Replay", "items_of_split", "parse_speed"]
 
 
 class Replay:
@@ -59,7 +57,7 @@ class Replay:
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
         policy = EmitPolicy.parse(emit)
-        self._speed = _parse_speed(speed)
+        self._speed = parse_speed(speed)
         self._split = split
         self._topic = topic
         self._recording = recording
@@ -94,40 +92,20 @@ class Replay:
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
         """
-        with contextlib.ExitStack() as opening:
-            sinks: list[Sink] = []
-
-            def add(sink: Sink) -> None:
-                sinks.append(sink)
-                opening.callback(sink.close, failed=True)
-
-            if console:
-                add(TerminalSink(console))
-            if json_lines:
-                add(JsonLinesSink(json_lines, features=with_features))
-            if recording_out:
-                add(RecordingSink(RecordingWriter(recording_out, overwrite=True)))
-            rec = open_recording(self._recording, self._topic)
-            # From here on the pipeline closes the sinks.
-            opening.pop_all()
-        with rec:
+        with open_recording(self._recording, self._topic) as rec:
+            sinks = open_sinks(
+                partial(TerminalSink, console) if console else None,
+                partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
+                partial(_recording_sink, recording_out) if recording_out else None,
+            )
+            items = items_of_split(rec.items(), self._split)
+            pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
+                items, self._session, sinks, speed=self._speed
+            )
             started = time.perf_counter()
-            asyncio.run(self._run(rec, sinks))
+            self.interrupted = run_until_interrupted([pipeline])
             self._seconds = time.perf_counter() - started
             self.losses = rec.losses
-
-    async def _run(self, recording: Recording, sinks: list[Sink]) -> None:
-        items = items_of_split(recording.items(), self._split)
-        pipeline = Pipeline(items, self._session, sinks, speed=self._speed)
-        loop = asyncio.get_running_loop()
-        for name in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(name, pipeline.stop)
-        try:
-            await pipeline.run()
-        finally:
-            for name in (signal.SIGINT, signal.SIGTERM):
-                loop.remove_signal_handler(name)
-        self.interrupted = pipeline.stats().stopped
 
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
@@ -164,7 +142,16 @@ def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterat
             yield item
 
 
-def _parse_speed(text: str) -> float | None:
+def _recording_sink(path: Path) -> RecordingSink:
+    return RecordingSink(RecordingWriter(path, overwrite=True))
+
+
+def parse_speed(text: str) -> float | None:
+    """Read a multiple of the recorded pace, or `max`, which is None.
+
+    Raises:
+        InputError: the text is neither.
+    """
     if text == "max":
         return None
     try:

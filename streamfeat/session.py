@@ -5,7 +5,7 @@ predicting and, on request, learning from labels.
 Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, where one is needed, is given.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,11 @@ from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.layout import BEFORE_TIME
-from streamfeat.recording import Label, Packet
+from streamfeat.packets import Label, Packet, Tick
 
-__all__ = ["Session", "SessionStats"]
+__all__ = ["Session", "SessionStats", "StreamItem"]
+
+StreamItem = Packet | Label | Tick
 
 _TRACE = 32
 """Events whose features are held at a time under `event`."""
@@ -38,6 +40,7 @@ class SessionStats:
         rejected: outside the sensor, or malformed.
         saturated: accepted without changing a clipped count.
         emissions: readings made.
+        incomplete: of those, how many lacked packets known to be missing from the window.
         samples: labelled samples that ended.
         correct: of those, how many were predicted rightly; None without a classifier.
         unknown_labels: samples that could not be learned from, because the classifier lacks their label.
@@ -48,6 +51,7 @@ class SessionStats:
     rejected: int = 0
     saturated: int = 0
     emissions: int = 0
+    incomplete: int = 0
     samples: int = 0
     correct: int | None = None
     unknown_labels: int = 0
@@ -57,14 +61,18 @@ class Session:
     """Feeds one camera's packets and labels to an engine, and reads it as the policy says.
 
     A labelled sample starts with an empty window and its own origin, so its features are those of the
-    offline path. Packets of another resolution start a new engine.
+    offline path. Packets of another resolution start a new engine, packets of another epoch an empty window.
+    Whoever is behind reads as `auto` does until it has caught up, whatever the policy: events are not dropped
+    for readings. Readings of a window that packets are missing from are marked.
 
     Args:
         encoder: the frozen encoder.
         policy: when to read.
         classifier: predicts from each reading.
         learn_online: learn from each labelled sample after predicting it (prequential).
-        clock: seconds, monotonic; used by the `auto` policy only.
+        clock: seconds, monotonic; used by the `auto` policy and by those who are behind.
+        topic: named in emissions.
+        is_behind: tells from `log_time_ns` of the packet in hand whether it has waited too long.
         engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
 
     Raises:
@@ -79,6 +87,8 @@ class Session:
         *,
         learn_online: bool = False,
         clock: Callable[[], float] = lambda: 0.0,
+        topic: str = "",
+        is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
@@ -89,6 +99,8 @@ class Session:
         self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
         self._classifier = classifier
         self._clock = clock
+        self._topic = topic
+        self._is_behind = is_behind
         self._make_engine = engine
         self._every_event = policy == EmitPolicy("events", 1)
         self._engine: Engine | None = None
@@ -99,6 +111,12 @@ class Session:
         self._unread = 0
         self._next_us: int | None = None
         self._rest_until = 0.0
+        self._epoch: int | None = None
+        self._silent_us = BEFORE_TIME
+        self._incomplete_us = BEFORE_TIME
+        self._lost = False
+        self._log_time_ns = 0
+        self._source_ns = 0
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -113,24 +131,34 @@ class Session:
             _add_engine(total, self._engine)
         return total
 
-    def process(self, item: Packet | Label) -> Iterator[Emission]:
+    def process(self, item: StreamItem) -> Iterator[Emission]:
         """Take in one item of the stream, and yield what is read on the way."""
+        if isinstance(item, Tick):
+            self._source_ns = 0
+            yield from self._pass_time(item.t_us)
+            return
         if isinstance(item, Label):
             yield from self._finish_sample()
             self._sample, self._seen_label = item, True
-            self._origin = item.start_us
-            self._last_us = item.start_us
-            self._next_us = None
-            self._unread = 0
-            if self._engine:
-                self._engine.restart(item.start_us)
+            self._start_anew(item.start_us)
             return
+        if self._epoch not in (None, item.epoch):
+            yield from self._finish_sample()
+            self._start_anew(0)
+            self._lost = True
+        self._epoch = item.epoch
+        self._lost |= item.lost > 0
+        self._log_time_ns, self._source_ns = item.log_time_ns, item.source_ns
         events = item.events
         if len(events) == 0:
             return
         engine = self._engine_for(item.resolution)
         sound = _sound(events, item.resolution)
         latest = self._stream_times(events, sound)
+        if self._lost:
+            # What is missing came before this packet, so it has left the window one window after it.
+            self._incomplete_us = max(self._incomplete_us, int(latest[0]) + self._window_us)
+            self._lost = False
         end = len(events)
         if self._sample:
             stop = self._sample.start_us + self._sample.duration_us
@@ -147,11 +175,37 @@ class Session:
 
     def finish(self) -> Iterator[Emission]:
         """End the stream: the open sample is read, and what was collected is learned."""
+        self._source_ns = 0
         yield from self._finish_sample()
         if self._unread and self._engine:
             yield self._read(self._engine, self._last_us + 1)
         if self.learner:
             self.learner.flush()
+
+    def _start_anew(self, origin_us: int) -> None:
+        """Begin with an empty window whose bins start at the origin."""
+        self._origin = origin_us
+        self._last_us = origin_us
+        self._next_us = None
+        self._unread = 0
+        self._silent_us = self._incomplete_us = BEFORE_TIME
+        if self._engine:
+            self._engine.restart(origin_us)
+
+    def _pass_time(self, t_us: int) -> Iterator[Emission]:
+        """Read what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
+        sample, engine = self._sample, self._engine
+        if sample and t_us >= sample.start_us + sample.duration_us:
+            yield from self._finish_sample()
+        if engine is None or (self._seen_label and not self._sample):
+            return
+        every = self.policy.every if self.policy.kind == "time" else self.encoder.geometry.bin_us
+        if self._next_us is None:
+            self._next_us = self._following(self._last_us, every)
+        while (due := self._due(t_us, every)) <= t_us:
+            yield self._read(engine, due)
+            self._next_us = due + every
+            self._silent_us = due
 
     def _stream_times(self, events: Events, sound: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Stream time after each event: it never goes back, and events that will be rejected have no say."""
@@ -163,83 +217,123 @@ class Session:
     def _engine_for(self, resolution: Resolution) -> Engine:
         if self._engine and self._engine.resolution == resolution:
             return self._engine
-        if self._engine:
-            _add_engine(self._stats, self._engine)
-        self._engine = self._make_engine(
+        engine = self._make_engine(
             self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event
         )
-        return self._engine
+        if self._engine:
+            _add_engine(self._stats, self._engine)
+        self._engine = engine
+        return engine
 
     def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
-        if len(events) == 0:
-            return
+        done = 0
         if self._every_event:
-            yield from self._trace(engine, events, latest)
+            done = yield from self._trace(engine, events, latest)
         elif self.policy.kind == "time":
-            yield from self._feed_by_time(engine, events, latest)
+            done = yield from self._feed_by_time(engine, events, latest)
         elif self.policy.kind == "events":
-            yield from self._feed_by_count(engine, events, latest)
-        else:
-            self._take(engine, events, latest)
-            now = self._clock()
-            if now >= self._rest_until:
-                yield self._read(engine, self._last_us + 1)
-                spent = self._clock() - now
-                self._rest_until = now + spent * (1 + _AUTO_REST)
+            done = yield from self._feed_by_count(engine, events, latest)
+        if done < len(events):
+            yield from self._feed_at_once(engine, events[done:], latest[done:])
 
-    def _trace(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
-        """One emission an event; some at a time, because that many calls from Python would cost far more."""
-        before = self._stats.events
-        for start in range(0, len(events), _TRACE):
+    def _trace(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """One emission an event, until all is done or others wait; tells how many were followed.
+
+        Some events at a time, because that many calls from Python would cost far more.
+        """
+        start, before = 0, self._stats.events
+        while start < len(events) and not self._is_behind(self._log_time_ns):
             traced = slice(start, min(start + _TRACE, len(events)))
             features, accepted = engine.trace(events[traced])
-            times = latest[traced] + 1
             self._last_us = max(self._last_us, int(latest[traced][-1]))
-            self._stats.emissions += len(features)
-            labels, scores = self._scores(features)
-            for i in range(len(features)):
-                yield Emission(
-                    t_us=int(times[i]),
-                    n_events=before + int(accepted[i]),
-                    features=features[i],
-                    labels=labels,
-                    scores=scores[i],
-                    sample=self._sample,
-                    final=False,
-                )
+            times, scores = latest[traced].tolist(), self._scores(features)
+            for i, n_events in enumerate(accepted.tolist()):
+                yield self._emission(times[i] + 1, before + n_events, features[i], scores[i])
+            self._unread = 0
+            start = traced.stop
+        return start
 
-    def _scores(self, features: NDArray[np.float32]) -> tuple[tuple[str, ...], NDArray[np.float32]]:
-        """Labels, and the scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
+    def _scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
         classifier = self.classifier
-        if classifier is None:
-            return (), np.zeros((len(features), 0), np.float32)
-        return classifier.labels, classifier.scores(features)
+        return classifier.scores(features) if classifier else np.zeros((len(features), 0), np.float32)
 
-    def _feed_by_count(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+    def _emission(
+        self,
+        t_us: int,
+        n_events: int,
+        features: NDArray[np.float32],
+        scores: NDArray[np.float32],
+        *,
+        final: bool = False,
+    ) -> Emission:
+        # After a silence that was read, stream time as told by events may lie behind it.
+        t_us = max(t_us, self._silent_us)
+        incomplete = t_us <= self._incomplete_us
+        self._stats.emissions += 1
+        self._stats.incomplete += incomplete
+        classifier = self.classifier
+        return Emission(
+            t_us=t_us,
+            n_events=n_events,
+            features=features,
+            labels=classifier.labels if classifier else (),
+            scores=scores,
+            sample=self._sample,
+            final=final,
+            topic=self._topic,
+            incomplete=incomplete,
+            source_ns=self._source_ns,
+        )
+
+    def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        engine.feed(events)
+        self._note(events, latest)
+        self._next_us = None
+        now = self._clock()
+        if now >= self._rest_until:
+            yield self._read(engine, self._last_us + 1)
+            spent = self._clock() - now
+            self._rest_until = now + spent * (1 + _AUTO_REST)
+
+    def _feed_by_count(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """Feed and read until all is done, or others wait; tells how many were fed."""
         start = 0
-        while start < len(events):
-            stop = min(start + self.policy.every - self._unread, len(events))
+        self._next_us = None
+        while start < len(events) and not self._is_behind(self._log_time_ns):
+            stop = min(start + max(self.policy.every - self._unread, 1), len(events))
             self._take(engine, events[start:stop], latest[start:stop])
             start = stop
-            if self._unread == self.policy.every:
+            if self._unread >= self.policy.every:
                 yield self._read(engine, self._last_us + 1)
+        return start
 
-    def _feed_by_time(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+    def _feed_by_time(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """Feed and read until all is done, or others wait; tells how many were fed."""
         start = 0
-        while start < len(events):
-            due = self._due(int(latest[start]))
-            stop = int(np.searchsorted(latest, due)) if due is not None else len(events)
+        while start < len(events) and not self._is_behind(self._log_time_ns):
+            due = self._due(int(latest[start]), self.policy.every)
+            stop = int(np.searchsorted(latest, due))
             if stop > start:
                 self._take(engine, events[start:stop], latest[start:stop])
                 start = stop
-            elif due is not None:
+            else:
                 yield self._read(engine, due)
                 self._next_us = due + self.policy.every
+        return start
 
-    def _due(self, t_us: int) -> int | None:
-        """When to read next, given an event at `t_us`; readings of an empty window are passed over."""
-        every = self.policy.every
-        following = t_us - (t_us - self._origin) % every + every
+    def _following(self, t_us: int, every: int) -> int:
+        return t_us - (t_us - self._origin) % every + every
+
+    def _due(self, t_us: int, every: int) -> int:
+        """When to read next, given stream time `t_us`; readings of an empty window are passed over."""
+        following = self._following(t_us, every)
         if self._next_us is None:
             self._next_us = following
         # After this nothing changes until the next event. Between labelled samples nobody asks.
@@ -254,6 +348,9 @@ class Session:
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
         engine.feed(events)
+        self._note(events, latest)
+
+    def _note(self, events: Events, latest: NDArray[np.int64]) -> None:
         self._unread += len(events)
         self._last_us = max(self._last_us, int(latest[-1]))
 
@@ -261,17 +358,8 @@ class Session:
         engine.advance(t_us - 1)
         features = engine.features()
         self._unread = 0
-        self._stats.emissions += 1
-        labels, scores = self._scores(features[np.newaxis])
-        return Emission(
-            t_us=t_us,
-            n_events=self._stats.events + engine.n_events,
-            features=features,
-            labels=labels,
-            scores=scores[0],
-            sample=self._sample,
-            final=final,
-        )
+        scores = self._scores(features[np.newaxis])[0]
+        return self._emission(t_us, self._stats.events + engine.n_events, features, scores, final=final)
 
     def _finish_sample(self) -> Iterator[Emission]:
         sample = self._sample

@@ -7,8 +7,9 @@ Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`)
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol, TextIO, TypeVar
 
 from rich.console import Console
 from rich.text import Text
@@ -17,24 +18,51 @@ from streamfeat.emission import Emission
 from streamfeat.errors import InputError
 from streamfeat.recorder import RecordingWriter
 
-__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record"]
+__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record", "open_sinks"]
 
 _LINES_A_SECOND = 4.0
 
+T = TypeVar("T", contravariant=True)
 
-class Sink(Protocol):
-    """Takes emissions in order. May block; is called from one thread at a time."""
 
-    def write(self, emissions: Sequence[Emission]) -> None:
-        """Take some emissions, at least one."""
+class Sink(Protocol[T]):
+    """Takes emissions, or whatever else a pipeline makes, in order. May block; is called from one thread at a
+    time.
+    """
+
+    def write(self, emissions: Sequence[T], /) -> None:
+        """Take some, at least one."""
 
     def close(self, *, failed: bool) -> None:
         """End: finish what was written, or (`failed`) leave nothing half done behind."""
 
 
+S = TypeVar("S", bound=Sink[Any])
+
+
+def open_sinks(*makers: Callable[[], S] | None) -> list[S]:
+    """Make the sinks that are wanted: all of them or, when one cannot be made, none is left open.
+
+    Args:
+        makers: without arguments; what is None is not wanted.
+    """
+    with ExitStack() as opening:
+        sinks: list[S] = []
+        for make in makers:
+            if make:
+                sinks.append(make())
+                opening.callback(sinks[-1].close, failed=True)
+        opening.pop_all()
+    return sinks
+
+
 def emission_record(emission: Emission, *, features: bool = False) -> dict[str, Any]:
     """An emission as JSON values."""
     record: dict[str, Any] = {"t_us": emission.t_us, "n_events": emission.n_events}
+    if emission.topic:
+        record["topic"] = emission.topic
+    if emission.incomplete:
+        record["incomplete"] = True
     if emission.labels:
         record["prediction"] = emission.prediction
         record["scores"] = {
@@ -90,20 +118,30 @@ class JsonLinesSink:
 
 
 class RecordingSink:
-    """Features, predictions and labels as MCAP messages."""
+    """Features, predictions and labels as MCAP messages.
 
-    def __init__(self, writer: RecordingWriter) -> None:
-        """Write with `writer`, which is closed with the sink."""
+    Args:
+        writer: closed with the sink.
+        topic_of: the topic for `label`, `features` or `prediction` of the camera with a given topic.
+    """
+
+    def __init__(
+        self, writer: RecordingWriter, topic_of: Callable[[str, str], str] = lambda topic, kind: f"/{kind}"
+    ) -> None:
+        """Write nothing yet."""
         self._writer = writer.__enter__()
+        self._topic_of = topic_of
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Write a features message for each emission, and a prediction where there is one."""
         for e in emissions:
             if e.final and e.sample:
-                self._writer.write_label(e.sample)
-            self._writer.write_features(e.t_us, e.n_events, e.features)
+                self._writer.write_label(e.sample, self._topic_of(e.topic, "label"))
+            topic = self._topic_of(e.topic, "features")
+            self._writer.write_features(e.t_us, e.n_events, e.features, incomplete=e.incomplete, topic=topic)
             if e.prediction is not None:
-                self._writer.write_prediction(e.t_us, e.prediction, e.labels, e.scores)
+                topic = self._topic_of(e.topic, "prediction")
+                self._writer.write_prediction(e.t_us, e.prediction, e.labels, e.scores, topic=topic)
 
     def close(self, *, failed: bool) -> None:
         """Finish the file, or leave none."""
@@ -153,6 +191,8 @@ class TerminalSink:
     def _line(self, e: Emission) -> Text:
         line = Text()
         line.append(f"{e.t_us / 1e6:9.2f} s ", style="dim")
+        if e.topic:
+            line.append(f"{e.topic}  ", style="cyan")
         line.append(f"{e.n_events:>11,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
@@ -171,4 +211,6 @@ class TerminalSink:
             quadrants = e.features.reshape(4, -1)
             line.append("by quadrant ", style="dim")
             line.append(" ".join(f"{float(abs(q).sum()):9.1f}" for q in quadrants))
+        if e.incomplete:
+            line.append("  incomplete", style="yellow")
         return line

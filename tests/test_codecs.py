@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat import codecs
 from streamfeat.codecs import ENCODINGS, Evt3Decoder, LibcaerCmpDecoder, encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, make_events
@@ -222,10 +221,19 @@ def test_unknown_libcaer_cmp_word_changes_nothing():
     assert rows(decoder.decode(words(0x3001), 0)) == [(7, 1, 0, 0)]
 
 
-def test_payload_of_too_many_events(monkeypatch):
-    monkeypatch.setattr(codecs, "MAX_PACKET_EVENTS", 20)
-    with pytest.raises(InputError, match="24 records or events in one packet, more than 20"):
-        decode("evt3", words(0x4FFF, 0x4FFF))
+@pytest.mark.parametrize(
+    ("encoding", "payload"),
+    [
+        ("evt3", words(0x4FFF, 0x4FFF)),
+        ("libcaer_cmp", words(0x50FF, 0x50FF, 0x50FF)),
+        ("mono", bytes(24 * 8)),
+        ("libcaer", bytes(24 * 8)),
+    ],
+)
+def test_payload_of_too_many_events(encoding, payload):
+    make_decoder(encoding, 24).decode(payload, 0)
+    with pytest.raises(InputError, match="24 records or events in one packet, more than 23"):
+        make_decoder(encoding, 23).decode(payload, 0)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ LAYERS = [
     {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine"},
     {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
     {"kernels.encode", "codecs", "safe_arrays"},
-    {"kernels.planes"},
+    {"kernels.planes", "packets"},
     {"kernels.update"},
     {"kernels.follow"},
     {"operator", "state", "recording"},
@@ -25,8 +25,8 @@ LAYERS = [
     {"encoder", "sinks", "report"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
-    {"pipeline"},
-    {"replay"},
+    {"cameras", "pipeline"},
+    {"replay", "live"},
     {"latency"},
     {"cli"},
 ]
@@ -42,15 +42,24 @@ ROOMS = {
     ],
     "foreign": [{"words"}, {"tables"}, {"containers"}, {"event_files"}, {"datasets"}],
     "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
-    "cli": [{"program"}, {"learning", "measuring", "recordings", "streaming"}],
+    "live": [
+        {"clock", "delivery", "inbox", "names"},
+        {"intake"},
+        {"health", "network", "publisher"},
+        {"listen", "publish", "record"},
+    ],
+    "cli": [{"program"}, {"learning", "live", "measuring", "recordings", "streaming"}],
 }
 """The same inside packages that are one place in the layers."""
 
 ONLY_IN = {
-    "asyncio": {"pipeline", "replay", "latency.hop"},
+    "asyncio": {"pipeline", "latency.hop"},
     "mcap": {"mcap_records", "recording", "recorder"},
-    "zenoh": {"live"},
-    "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.measuring", "cli.streaming"},
+    "zenoh": {"live.network", "live.publisher", "live.publish"},
+    "prometheus_client": {"live.health"},
+    "typer": {
+        f"cli.{name}" for name in ("program", "recordings", "learning", "live", "measuring", "streaming")
+    },
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "latency.picture"},
     "matplotlib": {"latency.picture"},

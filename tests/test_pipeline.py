@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 import tempfile
 import threading
 import time
@@ -12,7 +14,7 @@ import tiny
 
 from streamfeat.emission import EmitPolicy
 from streamfeat.errors import InputError
-from streamfeat.pipeline import Pipeline
+from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import open_recording
 from streamfeat.replay import Replay
@@ -106,6 +108,57 @@ def test_nothing_in_nothing_out():
     sink = ListSink()
     asyncio.run(Pipeline([], session(), [sink]).run())
     assert (sink.parts, sink.closed) == ([], "done")
+
+
+def test_what_is_there_does_not_wait_for_what_is_not():
+    """A live source says None when it has nothing more: what it gave is read before it goes on."""
+    sink, asked = ListSink(), threading.Event()
+
+    def source():
+        yield tiny.packet(tiny.steady(0, 15_000, 100))
+        yield None
+        yield None
+        assert asked.wait(30)
+        yield tiny.packet(tiny.steady(15_000, 30_000, 100, seed=1))
+
+    async def run():
+        pipeline = Pipeline(source(), session("10ms"), [sink])
+        task = asyncio.create_task(pipeline.run())
+        await until(lambda: sink.parts)
+        asked.set()
+        await task
+        assert pipeline.stats().items == 2
+
+    asyncio.run(run())
+    assert [e.t_us for e in sink.emissions[:2]] == [10_000, 20_000]
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_pipelines_side_by_side_end_well_on_a_signal(own):
+    read, sinks = [[], []], [ListSink(), ListSink()]
+    stopped = threading.Event()
+
+    def bounded(read):
+        for item in endless(read, 100):
+            if stopped.is_set():
+                return
+            yield item
+
+    pipelines = [Pipeline(bounded(r), session("50ev"), [s]) for r, s in zip(read, sinks, strict=True)]
+
+    def interrupt_when_both_run():
+        while not all(sink.parts for sink in sinks):
+            threading.Event().wait(0.001)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt_when_both_run)
+    thread.start()
+    assert run_until_interrupted(pipelines, stopped.set if own else None)
+    thread.join()
+    for sink, pipeline in zip(sinks, pipelines, strict=True):
+        assert sink.closed == "done"
+        assert sink.emissions[-1].n_events == 100 * pipeline.stats().items
+    assert not run_until_interrupted([Pipeline([], session(), [])])
 
 
 def endless(packets_read, n_events=40_000):

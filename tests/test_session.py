@@ -1,5 +1,7 @@
 """Sessions: when features are read, and that this never changes what they are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -10,6 +12,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.features import EventFeatures, encode_samples, sample_end
 from streamfeat.geometry import Geometry
+from streamfeat.packets import Tick
 from streamfeat.recording import Label, Packet, Sample
 from streamfeat.session import Session
 
@@ -386,3 +389,103 @@ def test_unknown_labels_are_counted_and_not_learned():
     _, session = run(tiny.labelled_items(6), "1000ev", classifier=clf, learn_online=True)
     assert session.stats().unknown_labels == 2
     assert session.classifier.provenance["learned_online"] == 4
+
+
+# --- live: silence, loss, clocks that start anew, and being behind
+
+
+def run_live(items, policy, **options):
+    session = Session(MODEL, EmitPolicy.parse(policy), **options)
+    return [e for item in items for e in session.process(item)], session
+
+
+@pytest.mark.parametrize("policy", ["10ms", "7ev", "event", "auto"])
+def test_ticks_read_what_decays_and_then_nothing(policy):
+    batch = tiny.steady(10_000, 20_000, 50)
+    packet = replace(tiny.packet(batch), source_ns=7)
+    ticks = [Tick("", t) for t in range(20_000, 5 * WINDOW, 3_000)]
+    emissions, session = run_live([packet, *ticks], policy)
+    of_events = len(run_live([packet], policy)[0])
+    assert [e.source_ns for e in emissions] == [7] * of_events + [0] * (len(emissions) - of_events)
+    every = 10_000 if policy == "10ms" else tiny.GEOMETRY.bin_us
+    silent = [e for e in emissions if e.t_us > 20_000]
+    assert (
+        times(silent)
+        == [t for t in range(every, 20_000 + WINDOW + every, every) if t > 20_000][: len(silent)]
+    )
+    for e in silent:
+        expected = MODEL.encode(batch, tiny.RESOLUTION, origin_us=0, t_us=e.t_us - 1)
+        assert np.array_equal(e.features, expected)
+    assert not silent[-1].features.any()
+    assert session.stats().events == 50
+    # One tick of hours says the same, and later events are not late.
+    far, session = run_live([tiny.packet(batch), Tick("", 10**12)], policy)
+    assert times(far) == times(emissions)
+    more = list(session.process(tiny.packet(tiny.steady(WINDOW, WINDOW + 100, 20))))
+    assert session.stats().late == 0
+    assert times(far + more) == sorted(times(far + more))
+
+
+def test_a_tick_ends_a_sample():
+    label = Label(10_000, 80_000, "cat")
+    items = [label, tiny.packet(tiny.steady(10_000, 50_000, 100))]
+    emissions, session = run_live([*items, Tick("", 89_999)], "1000ev")
+    assert not any(e.final for e in emissions)
+    final = next(iter(session.process(Tick("", 90_000))))
+    assert (final.final, final.t_us) == (True, 90_000)
+    assert np.array_equal(
+        final.features, run_live([*items, Label(500_000, 1, "x")], "1000ev")[0][-1].features
+    )
+    assert list(session.process(Tick("", 10**9))) == []
+
+
+def test_ticks_before_any_event_say_nothing():
+    assert run_live([Tick("", 10**9)], "10ms")[0] == []
+
+
+@pytest.mark.parametrize("policy", ["10ms", "7ev", "auto"])
+def test_a_loss_marks_readings_until_it_has_left_the_window(policy):
+    items = [tiny.packet(tiny.steady(t, t + 10_000, 40, seed=t)) for t in range(0, 500_000, 10_000)]
+    items[10] = replace(items[10], lost=3)
+    emissions, session = run_live(items, policy)
+    first = int(items[10].events["t"][0])
+    for e in emissions:
+        assert e.incomplete == (int(items[9].events["t"][-1]) < e.t_us <= first + WINDOW) or e.t_us <= first
+    assert any(e.incomplete for e in emissions)
+    assert session.stats().incomplete == sum(e.incomplete for e in emissions) < len(emissions) / 2
+
+
+def test_another_epoch_is_an_empty_window():
+    before, after = tiny.steady(10**9, 10**9 + 1000, 50), tiny.steady(500, 20_000, 30, seed=1)
+    items = [tiny.packet(before), replace(tiny.packet(after), epoch=1)]
+    emissions, session = run_live(items, "15ev")
+    assert session.stats().late == 0
+    assert emissions[-1].t_us == int(after["t"][-1]) + 1
+    assert np.array_equal(emissions[-1].features, MODEL.encode(after, tiny.RESOLUTION, origin_us=0))
+    assert emissions[-1].incomplete
+    assert not emissions[0].incomplete
+
+
+@pytest.mark.parametrize("policy", ["event", "7ev", "10ms"])
+def test_who_is_behind_reads_less_and_loses_nothing(policy):
+    items = [tiny.packet(tiny.steady(t, t + 50_000, 400, seed=t)) for t in range(0, 500_000, 50_000)]
+    behind = [False]
+    clock = iter(range(10**6))
+    session = Session(
+        MODEL, EmitPolicy.parse(policy), clock=lambda: float(next(clock)), is_behind=lambda _: behind[0]
+    )
+    counts = []
+    for i, item in enumerate(items):
+        behind[0] = 2 <= i < 8
+        counts.append(len(list(session.process(item))))
+    assert max(counts[2:8]) <= 1
+    assert min(counts[:2] + counts[8:]) >= 4
+    last = [*session.process(tiny.packet(tiny.stream([500_000]))), *session.finish()][-1]
+    whole = np.concatenate([*(item.events for item in items), tiny.stream([500_000])])
+    assert np.array_equal(last.features, MODEL.encode(whole, tiny.RESOLUTION, origin_us=0))
+    assert session.stats().events == 4001
+    # It can fall behind in the midst of a packet: it asks before every 32 events.
+    calls = iter([False] * 5 + [True] * 10**6)
+    session = Session(MODEL, EmitPolicy.parse("event"), is_behind=lambda _: next(calls))
+    assert len(list(session.process(items[0]))) == 5 * 32 + 1
+    assert session.stats().events == 400

@@ -27,7 +27,7 @@ from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.pipeline import Pipeline
 from streamfeat.recording import Label, Packet
-from streamfeat.session import Session
+from streamfeat.session import Session, StreamItem
 
 __all__ = ["hop", "without_silence"]
 
@@ -65,7 +65,8 @@ def hop(
     """
     engine = partial(_engine, look_ahead)
     warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
-    asyncio.run(Pipeline(warm_up, warming, [_WatchedSink()]).run())
+    warmed: Pipeline[Item, Emission] = Pipeline(warm_up, warming, [_WatchedSink()])
+    asyncio.run(warmed.run())
     started: list[tuple[int, int]] = []
 
     def note(t_us: int) -> None:
@@ -74,7 +75,7 @@ def hop(
 
     session = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
     sink = _WatchedSink()
-    pipeline = Pipeline(
+    pipeline: Pipeline[Item, Emission] = Pipeline(
         without_silence(items, encoder.geometry.window_us),
         session,
         [sink],
@@ -106,7 +107,7 @@ def without_silence(items: Iterable[Item], gap_us: int) -> Iterator[Item]:
             yield replace(item, events=events)
 
 
-async def _run(pipeline: Pipeline, goes: Callable[[], bool]) -> int:
+async def _run(pipeline: Pipeline[Item, Emission], goes: Callable[[], bool]) -> int:
     """Run until the end or until it goes no more; when that was, in nanoseconds of the clock."""
     loop = asyncio.get_running_loop()
     stopped: list[int] = []
@@ -135,10 +136,10 @@ class _WatchedSession(Session):
         self.brought_by_us: list[int] = []
         self._latest_us = 0
 
-    def process(self, item: Item) -> Iterator[Emission]:
+    def process(self, item: StreamItem) -> Iterator[Emission]:
         if isinstance(item, Label):
             self._latest_us = max(self._latest_us, item.start_us)
-        elif len(item.events):
+        elif isinstance(item, Packet) and len(item.events):
             self._latest_us = max(self._latest_us, int(item.events["t"].max()))
         for emission in super().process(item):
             self.brought_by_us.append(self._latest_us)

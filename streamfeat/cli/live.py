@@ -1,0 +1,238 @@
+"""Commands for live topics: listen, publish, record, recover, topics.
+
+Lives here: their arguments, and how their results are shown.
+Not here: the jobs (`live`).
+"""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from streamfeat.cli.program import (
+    JsonOption,
+    ModelOption,
+    OverwriteOption,
+    app,
+    err,
+    out,
+    print_losses,
+    print_result,
+    refuse_existing,
+)
+from streamfeat.errors import InputError
+
+if TYPE_CHECKING:
+    from streamfeat.live.names import Names
+
+__all__ = ["listen", "publish", "record", "recover", "topics"]
+
+KeyArgument = Annotated[
+    str | None, typer.Argument(metavar="KEYEXPR", help="zenoh key expression, such as robot/*/events.")
+]
+RosOption = Annotated[
+    str | None, typer.Option("--ros2", metavar="TOPIC", help="ROS 2 topic (rmw_zenoh) instead of a key.")
+]
+DomainOption = Annotated[int, typer.Option(help="ROS_DOMAIN_ID, with --ros2.")]
+ReliableOption = Annotated[
+    bool, typer.Option("--reliable", help="Recover missed packets; both ends must ask for it.")
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--zenoh-config", metavar="FILE", help="zenoh configuration (JSON5); else loopback only."),
+]
+PortOption = Annotated[int, typer.Option(help="Loopback port where sessions meet; without --zenoh-config.")]
+
+
+def _names(key: str | None, ros2: str | None, domain: int) -> "Names":
+    from streamfeat.live.names import PlainNames, RosNames
+
+    if (key is None) == (ros2 is None):
+        raise InputError("give a zenoh key expression, or a ROS 2 topic with --ros2")
+    if ros2 is not None:
+        return RosNames(ros2, domain)
+    return PlainNames(str(key))
+
+
+@app.command(
+    epilog="Example: streamfeat listen 'robot/*/events' -m recordings/digits.safetensors "
+    "-c recordings/digits_classifier.safetensors"
+)
+def listen(
+    model: ModelOption,
+    key: KeyArgument = None,
+    classifier: Annotated[
+        Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
+    ] = None,
+    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
+    ] = None,
+    json_lines: Annotated[
+        Path | None,
+        typer.Option(help="Write a JSON line for each emission to this file; - is stdout."),
+    ] = None,
+    features: Annotated[bool, typer.Option("--features", help="Include features in JSON lines.")] = False,
+    learn_online: Annotated[
+        bool, typer.Option("--learn-online", help="Learn from labels published beside the events.")
+    ] = False,
+    ros2: RosOption = None,
+    domain: DomainOption = 0,
+    reliable: ReliableOption = False,
+    max_delay: Annotated[
+        float, typer.Option(help="Seconds that packets may wait before the oldest are dropped.")
+    ] = 1.0,
+    metrics: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
+    ] = None,
+    zenoh_config: ConfigOption = None,
+    port: PortOption = 7447,
+    overwrite: OverwriteOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """The main job on live topics: one engine for each camera, results published beside it."""
+    from streamfeat.live.listen import Listen
+
+    for path in (output, json_lines):
+        if path and str(path) != "-":
+            refuse_existing(path, overwrite=overwrite)
+    names = _names(key, ros2, domain)
+    job = Listen(
+        names,
+        model,
+        classifier,
+        emit=emit,
+        learn_online=learn_online,
+        reliable=reliable,
+        zenoh_config=zenoh_config,
+        port=port,
+        metrics=metrics,
+        max_delay_s=max_delay,
+        console=err,
+    )
+    to_terminal = str(json_lines) == "-"
+    job.run(
+        console=None if quiet or as_json or to_terminal else out,
+        recording_out=output,
+        json_lines=sys.stdout if to_terminal else json_lines,
+        with_features=features,
+    )
+    if not to_terminal:
+        print_result(job.result(), "heard", as_json=as_json)
+
+
+@app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
+def publish(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="REC KEY...", help="Recordings, each followed by the key it is published on."),
+    ],
+    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "1",
+    loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
+    encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
+    wait: Annotated[float, typer.Option(help="Seconds to wait for somebody to subscribe.")] = 1.0,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Keys are ROS 2 topics (rmw_zenoh).")] = False,
+    domain: DomainOption = 0,
+    reliable: ReliableOption = False,
+    zenoh_config: ConfigOption = None,
+    port: PortOption = 7447,
+    as_json: JsonOption = False,
+) -> None:
+    """Recordings as live cameras, at their own pace or faster; several at once."""
+    from streamfeat.live.names import PlainNames, RosNames
+    from streamfeat.live.publish import Publish
+    from streamfeat.replay import parse_speed
+
+    if len(sources) % 2:
+        raise InputError("give each recording a key: publish ONE.mcap cam0/events TWO.mcap cam1/events")
+    pairs = [(Path(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
+    for _, key in pairs:
+        names = RosNames(key, domain) if ros2 else PlainNames(key)
+    job = Publish(
+        pairs,
+        names,
+        speed=parse_speed(speed),
+        loop=loop,
+        encoding=encoding,
+        reliable=reliable,
+        wait_s=wait,
+        zenoh_config=zenoh_config,
+        port=port,
+    )
+    job.run()
+    print_result(job.result(), "published", as_json=as_json)
+
+
+@app.command(epilog="Example: streamfeat record 'robot/*/events' -o drive.mcap")
+def record(
+    output: Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")],
+    key: KeyArgument = None,
+    compression: Annotated[str, typer.Option(help="Chunks: lz4, zstd or none.")] = "lz4",
+    chunk: Annotated[float, typer.Option(help="Seconds that a crash can cost.")] = 0.5,
+    ros2: RosOption = None,
+    domain: DomainOption = 0,
+    reliable: ReliableOption = False,
+    zenoh_config: ConfigOption = None,
+    port: PortOption = 7447,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
+    from streamfeat.live.record import Record
+
+    refuse_existing(output, overwrite=overwrite)
+    job = Record(
+        _names(key, ros2, domain),
+        output,
+        compression=compression,  # type: ignore[arg-type]
+        chunk_s=chunk,
+        overwrite=overwrite,
+        reliable=reliable,
+        zenoh_config=zenoh_config,
+        port=port,
+        console=err,
+    )
+    job.run()
+    print_result(job.result(), "recorded", as_json=as_json)
+
+
+@app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
+def recover(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Damaged or unfinished recording.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Whatever can be read of a damaged recording, in a new and intact one."""
+    from streamfeat.recorder import recover as recover_recording
+
+    losses = recover_recording(source, target, overwrite=overwrite)
+    result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
+    print_result(result, "recovered", as_json=as_json)
+    print_losses(losses)
+
+
+@app.command(epilog="Example: streamfeat topics --json")
+def topics(
+    seconds: Annotated[float, typer.Option(help="How long to listen.")] = 1.0,
+    zenoh_config: ConfigOption = None,
+    port: PortOption = 7447,
+    as_json: JsonOption = False,
+) -> None:
+    """Event topics that somebody publishes on, plain zenoh and ROS 2."""
+    from dataclasses import asdict
+
+    from streamfeat.live.network import find_topics, open_session
+
+    with open_session(zenoh_config, port=port) as session:
+        found = find_topics(session, seconds)
+    if as_json:
+        print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)
+        return
+    for topic in found:
+        where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"
+        out.print(f"{topic.name}  [dim]{where}, publishers: {topic.publishers}[/]", soft_wrap=True)
+    if not found:
+        out.print("nobody publishes events")

@@ -1,0 +1,204 @@
+"""How a live job is doing: counts for people and for Prometheus.
+
+Lives here: latencies, one view of everything that is counted, and serving it.
+Not here: counting itself, which each part does for its own work.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+from wsgiref.simple_server import WSGIServer
+
+from prometheus_client import CollectorRegistry, Histogram, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from streamfeat.cameras import Cameras, Gone
+from streamfeat.emission import Emission
+from streamfeat.errors import InputError
+from streamfeat.live.delivery import DeliveryStats
+from streamfeat.live.inbox import Inbox
+from streamfeat.live.intake import Intake, Warnings
+from streamfeat.pipeline import PipelineStats
+from streamfeat.session import StreamItem
+
+__all__ = ["Health", "parse_address"]
+
+_BUCKETS = tuple(scale * base for scale in (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0) for base in (1, 2, 5))
+_KEPT = 65_536
+
+
+class Health:
+    """Counts of one live job; a processor too, which times the cameras it wraps.
+
+    Args:
+        cameras: what is done with events.
+        intake: what was received.
+        inbox: what waits.
+        warnings: what was refused.
+
+    Attributes:
+        queues: tells how full the queues of the pipeline are.
+    """
+
+    def __init__(self, cameras: Cameras, intake: Intake, inbox: Inbox, warnings: Warnings) -> None:
+        """Start the clock."""
+        self._cameras = cameras
+        self._intake = intake
+        self._inbox = inbox
+        self._warnings = warnings
+        self._started = time.monotonic()
+        self.queues: Callable[[], PipelineStats] = PipelineStats
+        self._server: WSGIServer | None = None
+        self.registry = CollectorRegistry()
+        self._update = Histogram(
+            "streamfeat_update_latency_seconds",
+            "From a packet's turn to its last reading",
+            registry=self.registry,
+            buckets=_BUCKETS,
+        )
+        self._end_to_end = Histogram(
+            "streamfeat_end_to_end_latency_seconds",
+            "From a packet's publication, by its publisher's clock, to that of its features",
+            registry=self.registry,
+            buckets=_BUCKETS,
+        )
+        self._latencies: list[float] = []
+        self._n_latencies = 0
+        self.registry.register(self)
+
+    def process(self, item: StreamItem | Gone) -> Iterator[Emission]:
+        """Process an item with the cameras; only what they take of the clock is counted."""
+        spent = 0.0
+        readings = self._cameras.process(item)
+        while True:
+            started = time.perf_counter()
+            emission = next(readings, None)
+            spent += time.perf_counter() - started
+            if emission is None:
+                break
+            yield emission
+        self._update.observe(spent)
+
+    def finish(self) -> Iterator[Emission]:
+        """End the cameras' streams."""
+        yield from self._cameras.finish()
+
+    def on_published(self, source_ns: int, now_ns: int) -> None:
+        """Count how long it took from a packet's publication to that of its features."""
+        if source_ns:
+            seconds = (now_ns - source_ns) / 1e9
+            self._end_to_end.observe(seconds)
+            # The latest ones, so that a run of any length has an end.
+            if len(self._latencies) < _KEPT:
+                self._latencies.append(seconds)
+            else:
+                self._latencies[self._n_latencies % _KEPT] = seconds
+            self._n_latencies += 1
+
+    def serve(self, host: str, port: int) -> int:
+        """Serve the metrics over HTTP in a thread of its own; gives the port.
+
+        Raises:
+            InputError: the address cannot be used.
+        """
+        try:
+            self._server, _ = start_http_server(port, addr=host, registry=self.registry)
+        except OSError as error:
+            raise InputError(f"--metrics {host}:{port}: cannot listen there: {error.strerror}") from None
+        return int(self._server.server_port)
+
+    def stop_serving(self) -> None:
+        """Close the server, if there is one."""
+        if self._server:
+            self._server.shutdown()
+            self._server.server_close()
+
+    def delivery(self) -> DeliveryStats:
+        """Totals of all topics that are or were followed."""
+        return self._intake.delivery()
+
+    def collect(self) -> Iterable[Metric]:
+        """Everything that is counted elsewhere, for Prometheus."""
+        stats, delivery = self._cameras.stats(), self.delivery()
+        for name, value, text in (
+            ("events", stats.events, "Events accepted"),
+            ("late_events", stats.late, "Events older than the window"),
+            ("rejected_events", stats.rejected, "Events outside the sensor or malformed"),
+            ("emissions", stats.emissions, "Readings of features"),
+            ("incomplete_emissions", stats.incomplete, "Readings of windows that packets are missing from"),
+            ("packets", delivery.received, "Packets used"),
+            ("lost_packets", delivery.lost, "Packets that never arrived: gaps in their numbers"),
+            ("unheard_packets", delivery.unheard, "Numbers before the first packet of a camera"),
+            ("dropped_packets", self._inbox.dropped, "Packets dropped because ingest could not keep up"),
+            ("duplicate_packets", delivery.duplicates, "Packets that had arrived before"),
+            ("reordered_packets", delivery.reordered, "Packets that arrived late"),
+            ("foreign_packets", delivery.foreign, "Packets of a second publisher on the same key"),
+            ("publisher_restarts", delivery.restarts, "Publishers that took over or counted anew"),
+        ):
+            yield CounterMetricFamily(f"streamfeat_{name}", text, value=value)
+        refused = CounterMetricFamily("streamfeat_warnings", "What was refused or strange", labels=["reason"])
+        for reason, count in sorted(self._reasons().items()):
+            refused.add_metric([reason], count)
+        yield refused
+        pipeline = self.queues()
+        depth = GaugeMetricFamily("streamfeat_queue_depth", "What waits in each queue", labels=["queue"])
+        depth.add_metric(["inbox_messages"], self._inbox.depth)
+        depth.add_metric(["session_groups"], pipeline.queued_in)
+        depth.add_metric(["sink_groups"], pipeline.queued_out)
+        yield depth
+        yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        stats, delivery = self._cameras.stats(), self.delivery()
+        seconds = time.monotonic() - self._started
+        result: dict[str, Any] = {
+            "seconds": round(seconds, 3),
+            "cameras": self._cameras.seen,
+            "packets": delivery.received,
+            "events": stats.events,
+            "events_per_s": round(stats.events / max(seconds, 1e-9)),
+            "emissions": stats.emissions,
+            "incomplete": stats.incomplete,
+            "samples": stats.samples,
+        }
+        if stats.correct is not None and stats.samples:
+            result["correct"] = stats.correct
+            result["accuracy"] = round(stats.correct / stats.samples, 4)
+        result |= {
+            "lost": delivery.lost,
+            "unheard": delivery.unheard,
+            "dropped": self._inbox.dropped,
+            "duplicates": delivery.duplicates,
+            "reordered": delivery.reordered,
+            "restarts": delivery.restarts,
+            "foreign": delivery.foreign,
+            "late": stats.late,
+            "rejected": stats.rejected,
+            "warnings": dict(sorted(self._reasons().items())),
+        }
+        if self._latencies:
+            ordered = sorted(self._latencies)
+            for name, share in (("p50", 0.5), ("p99", 0.99)):
+                result[f"end_to_end_{name}_ms"] = round(1e3 * _at(ordered, share), 3)
+        return result
+
+    def _reasons(self) -> Counter[str]:
+        return Counter(dict(list(self._warnings.counts.items())))
+
+
+def _at(ordered: list[float], share: float) -> float:
+    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Read `HOST:PORT`.
+
+    Raises:
+        InputError: the text is none.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"--metrics {text!r} is not understood; give HOST:PORT, such as 127.0.0.1:9100")
+    return host, int(port)

@@ -1,0 +1,126 @@
+"""Where messages wait between the network's threads and the pipeline.
+
+Lives here: one bounded queue that never makes the network wait.
+Not here: what messages mean (`intake`), and who puts them in (`network`).
+
+When it is full, or the oldest has waited too long, whole messages are dropped, the oldest first, and counted
+for their topic.
+"""
+
+import math
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass
+
+from streamfeat.cameras import Gone
+
+__all__ = ["Inbox", "RawMessage"]
+
+_MAX_BYTES = 64 << 20
+_OVERHEAD = 512
+"""What a message costs besides its payload, so that their number is bounded too: 131,072 empty ones."""
+_TAKEN_AT_ONCE = 64
+
+
+@dataclass(slots=True)
+class RawMessage:
+    """One message as it came.
+
+    Attributes:
+        topic: where it was published, as shown.
+        schema: type of the message; '' if it can be none of ours.
+        payload: its bytes; empty if they are refused.
+        attachment: its bytes, at most 33 of interest.
+        arrived_ns: when, by the monotonic clock.
+        log_time_ns: when, since 1970.
+        problem: why it cannot be used, if that is known.
+        dropped: messages of this topic that were dropped since the one before.
+    """
+
+    topic: str
+    schema: str
+    payload: bytes
+    attachment: bytes
+    arrived_ns: int
+    log_time_ns: int
+    problem: str = ""
+    dropped: int = 0
+
+
+class Inbox:
+    """A bounded queue from many threads to one.
+
+    Args:
+        max_bytes: of payloads, with 512 more for each message.
+        max_delay_s: how long a message may wait.
+    """
+
+    def __init__(self, max_bytes: int = _MAX_BYTES, max_delay_s: float = math.inf) -> None:
+        """Start empty and open."""
+        self._max_bytes = max_bytes
+        self._max_delay_ns = max_delay_s * 1e9
+        self._items: deque[RawMessage | Gone] = deque()
+        self._bytes = 0
+        self._dropped: Counter[str] = Counter()
+        self._changed = threading.Condition()
+        self._closed = False
+        self.dropped = 0
+
+    @property
+    def depth(self) -> int:
+        """Messages that wait."""
+        return len(self._items)
+
+    def put(self, item: RawMessage | Gone) -> None:
+        """Add one at the end, and drop from the front while there is too much. Never waits."""
+        with self._changed:
+            if self._closed:
+                return
+            self._items.append(item)
+            if isinstance(item, RawMessage):
+                self._bytes += len(item.payload) + _OVERHEAD
+                self._drop_oldest(item.arrived_ns - self._max_delay_ns)
+            self._changed.notify()
+
+    def _drop_oldest(self, limit_ns: float) -> None:
+        kept = []
+        while self._items and (self._bytes > self._max_bytes or self._arrived_ns(self._items[0]) < limit_ns):
+            oldest = self._items.popleft()
+            if isinstance(oldest, RawMessage):
+                self._bytes -= len(oldest.payload) + _OVERHEAD
+                self._dropped[oldest.topic] += 1
+                self.dropped += 1
+            else:
+                kept.append(oldest)
+        self._items.extendleft(reversed(kept))
+
+    @staticmethod
+    def _arrived_ns(item: RawMessage | Gone) -> float:
+        return item.arrived_ns if isinstance(item, RawMessage) else math.inf
+
+    def take(self, timeout: float) -> list[RawMessage | Gone] | None:
+        """Take what is there, at most 64; wait if there is nothing.
+
+        Returns:
+            an empty list after `timeout` seconds, and None when the inbox is closed and empty.
+        """
+        with self._changed:
+            if not self._items and not self._closed:
+                self._changed.wait(timeout)
+            # Also when nothing new comes: what waits too long is dropped before it is taken.
+            self._drop_oldest(time.monotonic_ns() - self._max_delay_ns)
+            if not self._items:
+                return None if self._closed else []
+            taken = [self._items.popleft() for _ in range(min(len(self._items), _TAKEN_AT_ONCE))]
+            for item in taken:
+                if isinstance(item, RawMessage):
+                    self._bytes -= len(item.payload) + _OVERHEAD
+                    item.dropped = self._dropped.pop(item.topic, 0)
+            return taken
+
+    def close(self) -> None:
+        """Take in no more; what waits can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()

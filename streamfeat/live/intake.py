@@ -1,0 +1,326 @@
+"""From messages as they came to items of the stream: checked, counted, placed in time.
+
+Lives here: what is refused and why, warnings, who appears and who leaves, and time that passes in silence.
+Not here: the network (`network`), what is done with events (`cameras`).
+
+Whatever arrives is hostile until proven otherwise. A payload may have 4 MiB and 2^20 events, a sensor 2^22
+pixels, and no more than 256 topics are followed at a time, so that memory is bounded by those numbers and by
+the inbox. What is refused is counted under its reason, with one line a second and reason at most.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Self
+
+import numpy as np
+from rich.console import Console
+
+from streamfeat.cameras import Gone
+from streamfeat.errors import InputError
+from streamfeat.events import Resolution
+from streamfeat.live.clock import CameraClock
+from streamfeat.live.delivery import Delivery, DeliveryStats
+from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.names import Attachment
+from streamfeat.messages import EventPacket, LabelMessage
+from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader, Tick
+
+__all__ = ["MAX_PACKET_EVENTS", "MAX_PAYLOAD_BYTES", "Intake", "TopicState", "Warnings"]
+
+MAX_PAYLOAD_BYTES = 4 << 20
+MAX_PACKET_EVENTS = 1 << 20
+MAX_PIXELS = 1 << 22
+"""The largest event sensors have 2^20."""
+MAX_TOPICS = 256
+_MAX_SPAN_US = 60_000_000
+_MAX_LABEL_US = 3_600_000_000
+_MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * _MAX_LABEL_US
+"""Times go into message stamps, which have 31 bits of seconds."""
+_POLL_S = 0.02
+_IDLE_S = 0.25
+_FORGOTTEN_NS = 60_000_000_000
+SILENCE_S = 0.2
+"""A camera that has been silent for so long is taken to have nothing to say, and its time goes on."""
+
+
+class Warnings:
+    """Counts by reason, and says so once a second and reason at most.
+
+    Args:
+        say: given a line of text.
+        clock: seconds, monotonic.
+    """
+
+    def __init__(
+        self, say: Callable[[str], None] = lambda line: None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Nothing counted yet."""
+        self.counts: Counter[str] = Counter()
+        self._say = say
+        self._clock = clock
+        self._next: dict[str, float] = {}
+        self._silent: Counter[str] = Counter()
+
+    @classmethod
+    def on(cls, console: Console | None) -> Self:
+        """Say it there, or only count."""
+        if console is None:
+            return cls()
+        return cls(partial(console.print, style="yellow", markup=False, soft_wrap=True))
+
+    def add(self, reason: str, topic: str, detail: str) -> None:
+        """Count one, and say it unless that reason was said less than a second ago."""
+        self.counts[reason] += 1
+        now = self._clock()
+        if now < self._next.get(reason, now):
+            self._silent[reason] += 1
+            return
+        self._next[reason] = now + 1.0
+        more = self._silent.pop(reason, 0)
+        self._say(f"{reason}: {topic}: {detail}" + (f" ({more} more of these)" if more else ""))
+
+
+@dataclass(slots=True)
+class TopicState:
+    """What is known of one topic.
+
+    Attributes:
+        reader: its decoders.
+        clock: of its camera.
+        delivery: of its packets.
+        resolution: of its latest packet.
+        packets: used.
+        payload_bytes: of those.
+        heard_ns: when the latest message came, by the monotonic clock.
+        stream_us: time that its events have reached; None before the first.
+        silent_s: how long it has been silent, as far as this process was awake.
+        label_end_us: end of the latest labelled sample.
+        lost: packets missing or refused since the latest one.
+    """
+
+    reader: PacketReader
+    clock: CameraClock
+    delivery: Delivery = field(default_factory=Delivery)
+    resolution: Resolution | None = None
+    packets: int = 0
+    payload_bytes: int = 0
+    heard_ns: int = 0
+    stream_us: int | None = None
+    silent_s: float = 0.0
+    label_end_us: int = 0
+    lost: int = 0
+
+
+class Intake:
+    """An iterable of items for a pipeline, from an inbox; ends when the inbox is closed and empty.
+
+    Args:
+        inbox: where messages wait.
+        window_us: of the encoder; a silent camera's time goes on until its window is empty.
+        warnings: told what is refused and what is strange.
+        silence_s: how long a camera must be silent before its time goes on without it.
+    """
+
+    def __init__(
+        self, inbox: Inbox, window_us: int, warnings: Warnings, *, silence_s: float = SILENCE_S
+    ) -> None:
+        """Nothing is taken before iteration."""
+        self._inbox = inbox
+        self._window_us = window_us
+        self._warnings = warnings
+        self._silence_s = silence_s
+        self.topics: dict[str, TopicState] = {}
+        self._past = DeliveryStats()
+        self._early: dict[str, Label] = {}
+
+    def __iter__(self) -> Iterator[Packet | Label | Tick | Gone | None]:
+        """Yield items as they come; None when nothing more is there at the moment."""
+        looked = time.monotonic()
+        while (taken := self._inbox.take(_POLL_S if self.topics else _IDLE_S)) is not None:
+            for message in taken:
+                yield from self._items(message)
+            now = time.monotonic()
+            # Time during which this process was stopped says nothing about a camera's silence.
+            yield from self._silences(min(now - looked, 2 * _POLL_S))
+            looked = now
+            yield None
+
+    def delivery(self) -> DeliveryStats:
+        """Totals of all topics, past and present; may be called from another thread."""
+        total = DeliveryStats()
+        for part in (self._past, *(state.delivery.stats for state in list(self.topics.values()))):
+            total += part
+        return total
+
+    def _leave(self, topic: str) -> None:
+        """Nobody publishes here any more: what comes next is another life of this camera."""
+        state = self.topics.get(topic)
+        if state:
+            state.delivery.left()
+            state.reader = PacketReader(topic, MAX_PACKET_EVENTS)
+            state.clock = CameraClock(self._window_us)
+            state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
+
+    def _forget(self, topic: str) -> None:
+        state = self.topics.pop(topic, None)
+        if state:
+            self._past = self._past + state.delivery.stats
+
+    def _items(self, message: RawMessage | Gone) -> Iterator[Packet | Label | Tick | Gone]:
+        if isinstance(message, Gone):
+            self._leave(message.topic)
+            yield message
+            return
+        try:
+            if message.schema == LabelMessage.SCHEMA_NAME:
+                yield from self._label(message)
+            elif message.schema in EVENT_SCHEMAS:
+                yield from self._packet(message)
+            else:
+                raise _RefusalError("unknown type", message.schema[:80] or "not CDR")
+        except _RefusalError as refusal:
+            self._warnings.add(refusal.reason, message.topic, str(refusal))
+
+    def _label(self, message: RawMessage) -> Iterator[Label]:
+        """Give a label to the camera beside it, now or when its first packet comes."""
+        parent = message.topic.rpartition("/")[0]
+        try:
+            label = Label.from_cdr(message.payload)
+        except InputError as error:
+            raise _RefusalError("bad label", str(error)) from None
+        if not 0 <= label.duration_us <= _MAX_LABEL_US:
+            raise _RefusalError("bad label", f"{label.label[:40]!r} lasts {label.duration_us} us")
+        for topic in (parent, f"{parent}/events".lstrip("/"), f"{parent}/events"):
+            state = self.topics.get(topic)
+            if state and state.stream_us is not None:
+                if abs(label.start_us - state.stream_us) > _MAX_SPAN_US:
+                    raise _RefusalError("bad label", f"it starts at {label.start_us} us, far from the stream")
+                yield self._accept(label, topic, state)
+                return
+        self._early[parent] = label
+        while len(self._early) > MAX_TOPICS:
+            del self._early[next(iter(self._early))]
+
+    @staticmethod
+    def _accept(label: Label, topic: str, state: TopicState) -> Label:
+        state.label_end_us = label.start_us + label.duration_us
+        return replace(label, topic=topic)
+
+    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Tick]:
+        state = self._state(message.topic)
+        attachment = Attachment.unpack(message.attachment)
+        numbered = attachment or self._number_in(message)
+        verdict = state.delivery.see(numbered.gid, numbered.seq, message.arrived_ns, message.dropped)
+        if verdict.broken:
+            state.reader.resync()
+        if verdict.restarted:
+            self._warnings.add("publisher restarted", message.topic, f"now {numbered.gid.hex() or 'unnamed'}")
+        state.lost += verdict.lost
+        if verdict.foreign:
+            self._warnings.add("second publisher", message.topic, numbered.gid.hex() or "unnamed")
+        if not verdict.use:
+            return
+        if verdict.lost:
+            self._warnings.add(
+                "packets missing", message.topic, f"{verdict.lost} before number {numbered.seq}"
+            )
+        try:
+            packet = self._placed(state, message, numbered)
+        except _RefusalError:
+            state.lost += 1
+            raise
+        parent = message.topic.removesuffix("/events")
+        early = self._early.pop(parent if parent != "events" else "", None)
+        if early and state.stream_us is not None and abs(early.start_us - state.stream_us) <= _MAX_SPAN_US:
+            yield self._accept(early, message.topic, state)
+        yield replace(packet, lost=state.lost)
+        state.lost = 0
+        if len(packet.events) == 0 and state.stream_us is not None:
+            yield Tick(message.topic, state.stream_us)
+
+    def _placed(self, state: TopicState, message: RawMessage, numbered: Attachment) -> Packet:
+        """Decode a packet and bring its times onto the stream's."""
+        if message.problem:
+            raise _RefusalError(message.problem, f"at most {MAX_PAYLOAD_BYTES} bytes are read")
+        try:
+            packet = state.reader.read(message.schema, message.payload, message.log_time_ns, numbered.seq)
+        except InputError as error:
+            raise _RefusalError("bad packet", str(error)) from None
+        height, width = packet.resolution
+        if height * width > MAX_PIXELS:
+            raise _RefusalError("sensor too large", f"{width}x{height} pixels, at most {MAX_PIXELS}")
+        if state.resolution not in (None, packet.resolution):
+            self._warnings.add("resolution changed", message.topic, f"now {width}x{height}")
+        events = packet.events
+        # Events outside the sensor are rejected later; their times have no say.
+        sound = events["t"][(events["x"] < width) & (events["y"] < height)]
+        first = last = state.reader.time_us
+        if len(sound):
+            first, last = int(sound.min()), int(sound.max())
+        if first is not None and last is not None:
+            if last - first > _MAX_SPAN_US:
+                raise _RefusalError(
+                    "bad times", f"events of one packet are {(last - first) // 1_000_000} s apart"
+                )
+            if first < 0 or last > _MAX_STREAM_US:
+                raise _RefusalError("bad times", f"an event at {first if first < 0 else last} us")
+            place = state.clock.place(first, last, message.arrived_ns)
+            if place.event:
+                self._warnings.add(f"clock {place.event}", message.topic, f"{first} us")
+            if place.offset_us:
+                events = events.copy()
+                events["t"] += np.int64(place.offset_us)
+            if place.event in ("restarted", "jumped"):
+                state.stream_us = None
+            state.stream_us = max(state.stream_us or 0, last + place.offset_us)
+            packet = replace(packet, events=events, epoch=place.epoch)
+        state.resolution = packet.resolution
+        state.packets += 1
+        state.payload_bytes += len(message.payload)
+        state.heard_ns, state.silent_s = message.arrived_ns, 0.0
+        return replace(packet, source_ns=numbered.source_ns)
+
+    @staticmethod
+    def _number_in(message: RawMessage) -> Attachment:
+        """What a packet says of itself, for publishers that attach nothing."""
+        if message.schema == EventPacket.SCHEMA_NAME and not message.problem:
+            try:
+                packet = EventPacket.from_cdr(message.payload)
+            except InputError as error:
+                raise _RefusalError("bad packet", str(error)) from None
+            return Attachment(min(packet.seq, (1 << 63) - 1), packet.stamp_ns, b"")
+        reason = message.problem or "no sequence number"
+        raise _RefusalError(reason, f"{len(message.attachment)} bytes of attachment")
+
+    def _state(self, topic: str) -> TopicState:
+        if topic not in self.topics:
+            if len(self.topics) >= MAX_TOPICS:
+                oldest = min(self.topics, key=lambda name: self.topics[name].heard_ns)
+                if time.monotonic_ns() - self.topics[oldest].heard_ns < _FORGOTTEN_NS:
+                    raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
+                self._inbox.put(Gone(oldest))
+                self._forget(oldest)
+            reader = PacketReader(topic, MAX_PACKET_EVENTS)
+            self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
+        return self.topics[topic]
+
+    def _silences(self, passed_s: float) -> Iterator[Tick]:
+        for topic, state in self.topics.items():
+            if state.stream_us is None:
+                continue
+            state.silent_s += passed_s
+            now_us = state.stream_us + int((state.silent_s - self._silence_s) * 1e6)
+            end_us = max(state.stream_us + 2 * self._window_us, state.label_end_us + 1)
+            if state.stream_us < now_us and now_us - int(passed_s * 1e6) <= end_us:
+                yield Tick(topic, now_us)
+
+
+class _RefusalError(Exception):
+    """A message that cannot be used."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(detail)
+        self.reason = reason

@@ -1,0 +1,184 @@
+"""The main job on live topics: events in, features and predictions out, until somebody stops it.
+
+Lives here: putting together what listening needs, and ending well.
+Not here: each of the parts.
+"""
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.console import Console
+
+from streamfeat.cameras import Cameras, Gone
+from streamfeat.classifier import Classifier
+from streamfeat.codecs import ENCODINGS, encode, make_decoder
+from streamfeat.emission import Emission, EmitPolicy
+from streamfeat.encoder import Encoder
+from streamfeat.errors import InputError
+from streamfeat.events import make_events
+from streamfeat.live.health import Health, parse_address
+from streamfeat.live.inbox import Inbox
+from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.names import Names, beside
+from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.publisher import OutputSink
+from streamfeat.packets import Packet
+from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.recorder import RecordingWriter
+from streamfeat.session import Session, StreamItem
+from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
+
+__all__ = ["Listen"]
+
+PATIENCE_S = 0.05
+"""A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
+
+
+MAX_DELAY_S = 1.0
+"""Where even feeding cannot keep up, packets are dropped rather than being ever further behind."""
+
+
+class Listen:
+    """Listens on topics until `stop` or a signal.
+
+    Args:
+        names: of the topics.
+        model: of the encoder.
+        classifier: to predict with; none for features alone.
+        emit: when to read, see `EmitPolicy.parse`.
+        learn_online: learn from labels that are published beside the events.
+        reliable: recover missed packets and ask for history, from publishers that do the same.
+        zenoh_config: JSON5 file; without it, this machine alone.
+        port: where sessions on this machine meet.
+        metrics: `HOST:PORT` to serve Prometheus metrics on.
+        silence_s: how long a camera must be silent before its time goes on without it.
+        patience_s: how long packets may wait before readings are left out for them.
+        max_delay_s: how long packets may wait before the oldest are dropped.
+        console: for warnings.
+
+    Raises:
+        InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        names: Names,
+        model: Path,
+        classifier: Path | None = None,
+        *,
+        emit: str = "auto",
+        learn_online: bool = False,
+        reliable: bool = False,
+        zenoh_config: Path | None = None,
+        port: int = DEFAULT_PORT,
+        metrics: str | None = None,
+        silence_s: float = SILENCE_S,
+        patience_s: float = PATIENCE_S,
+        max_delay_s: float = MAX_DELAY_S,
+        console: Console | None = None,
+    ) -> None:
+        """Open and check everything but the network, before anything is written."""
+        self._policy = EmitPolicy.parse(emit)
+        self._encoder = Encoder.load(model)
+        self._classifier = Classifier.load(classifier) if classifier else None
+        if self._classifier:
+            self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
+        elif learn_online:
+            raise InputError("--learn-online needs a classifier to start from; give one with -c")
+        self._address = parse_address(metrics) if metrics else None
+        self._names = names
+        self._learn_online, self._reliable = learn_online, reliable
+        self._zenoh_config, self._port = zenoh_config, port
+        self._patience_ns = patience_s * 1e9
+        self.interrupted = False
+        self._warnings = Warnings.on(console)
+        self._inbox = Inbox(max_delay_s=max_delay_s)
+        window_us = self._encoder.geometry.window_us
+        self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s)
+        self._cameras = Cameras(self._make_session, on_refusal=self._on_refusal)
+        self.health = Health(self._cameras, self._intake, self._inbox, self._warnings)
+
+    def run(
+        self,
+        *,
+        console: Console | None = None,
+        recording_out: Path | None = None,
+        json_lines: Path | TextIO | None = None,
+        with_features: bool = False,
+        more: Sink[Emission] | None = None,
+    ) -> None:
+        """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
+
+        Args:
+            console: for live lines.
+            recording_out: MCAP file for features and predictions; replaced if it exists.
+            json_lines: file (replaced) or open stream for a JSON line for each emission.
+            with_features: include features in JSON lines.
+            more: one sink more.
+
+        Raises:
+            InputError: an output, the network or the metrics address cannot be used.
+        """
+        self._warm_up()
+        with open_session(self._zenoh_config, port=self._port) as session:
+            sinks = open_sinks(
+                partial(OutputSink, session, self._names, self.health.on_published),
+                partial(TerminalSink, console) if console else None,
+                partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
+                partial(_recording_sink, recording_out) if recording_out else None,
+                (lambda: more) if more else None,
+            )
+            pipeline: Pipeline[StreamItem | Gone, Emission] = Pipeline(self._intake, self.health, sinks)
+            self.health.queues = pipeline.stats
+            try:
+                if self._address:
+                    self.health.serve(*self._address)
+                with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+                    self.interrupted = run_until_interrupted([pipeline], self.stop)
+            finally:
+                self.health.stop_serving()
+
+    def stop(self) -> None:
+        """Take in no more; may be called from any thread."""
+        self._inbox.close()
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        return self.health.result() | {"interrupted": self.interrupted}
+
+    def _warm_up(self) -> None:
+        """Compile what the first packets would otherwise have to wait for."""
+        geometry = self._encoder.geometry
+        side = geometry.patch * geometry.downsample
+        event = make_events([0], [0], [1], [0])
+        for encoding in ENCODINGS:
+            payload, base_ns = encode(event, encoding)
+            make_decoder(encoding).decode(payload, base_ns)
+        # One in time and one too late: the two ways to feed.
+        for log_time_ns in (time.time_ns(), 0):
+            session = self._make_session("")
+            for _ in session.process(Packet("", event, (side, side), log_time_ns, 0)):
+                pass
+            for _ in session.finish():
+                pass
+
+    def _make_session(self, topic: str) -> Session:
+        return Session(
+            self._encoder,
+            self._policy,
+            self._classifier,
+            learn_online=self._learn_online,
+            clock=time.perf_counter,
+            topic=topic,
+            is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > self._patience_ns,
+        )
+
+    def _on_refusal(self, topic: str, reason: str, error: str) -> None:
+        self._warnings.add(reason, topic, error)
+
+
+def _recording_sink(path: Path) -> RecordingSink:
+    writer = RecordingWriter(path, overwrite=True, keep_partial=True, compression="lz4")
+    return RecordingSink(writer, lambda topic, kind: "/" + beside(topic, kind).lstrip("/"))

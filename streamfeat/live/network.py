@@ -1,0 +1,263 @@
+"""zenoh sessions: opened safely, subscribed to, asked what is there.
+
+Lives here: configuration, subscriptions that fill an inbox, liveliness of publishers.
+Not here: publishing (`publisher`), names (`names`), what messages mean (`intake`).
+
+Without a configuration file a session is on this machine alone: the first to come listens on 127.0.0.1:7447,
+later ones connect to it and keep trying, and nobody scouts by multicast. Sessions that know one another find
+the others through it. A ROS 2 router (`rmw_zenohd`) on this machine is found in the same way.
+"""
+
+import json
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import zenoh
+import zenoh.ext
+from zenoh.handlers import Callback
+
+from streamfeat.cameras import Gone
+from streamfeat.errors import InputError
+from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.intake import MAX_PAYLOAD_BYTES
+from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
+from streamfeat.packets import EVENT_SCHEMAS
+
+__all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "find_topics", "open_session"]
+
+DEFAULT_PORT = 7447
+_MAX_MESSAGE_BYTES = 16 << 20
+"""What zenoh puts together from fragments; a message of more never reaches us."""
+_QUEUED_BATCHES = 16
+"""Of 64 kB, the most that zenoh allows: a reader that hesitates costs a camera nothing yet."""
+_PATIENCE = {"drop": {"wait_before_drop": 50_000}, "block": {"wait_before_close": 60_000_000}}
+"""Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
+_HISTORY = 256
+"""Packets that a reliable subscriber asks a publisher for when it joins late."""
+
+
+def open_session(config: Path | None = None, *, port: int = DEFAULT_PORT) -> zenoh.Session:
+    """Open a session.
+
+    Args:
+        config: JSON5 configuration of zenoh, used as it is, but that messages are given timestamps, which
+            recovering lost ones needs; without it, this machine alone.
+        port: where sessions on this machine meet; only without `config`.
+
+    Raises:
+        InputError: the file cannot be read or does not hold a configuration, or zenoh cannot open with it.
+    """
+    if config:
+        try:
+            chosen = zenoh.Config.from_file(config)
+            chosen.insert_json5("timestamping", "{enabled: true}")
+            return zenoh.open(chosen)
+        except (zenoh.ZError, OSError) as error:
+            raise InputError(f"{config}: zenoh cannot use this configuration: {_first_line(error)}") from None
+    meeting = f"tcp/127.0.0.1:{port}"
+    try:
+        return zenoh.open(_loopback([meeting], []))
+    except zenoh.ZError:
+        try:
+            return zenoh.open(_loopback(["tcp/127.0.0.1:0"], [meeting]))
+        except zenoh.ZError as error:
+            raise InputError(f"zenoh cannot open a session on this machine: {_first_line(error)}") from None
+
+
+def _loopback(listen: list[str], connect: list[str]) -> zenoh.Config:
+    return zenoh.Config.from_json5(
+        json.dumps(
+            {
+                "mode": "peer",
+                "listen": {"endpoints": listen, "exit_on_failure": True},
+                "connect": {
+                    "endpoints": connect,
+                    "timeout_ms": -1,
+                    "exit_on_failure": False,
+                    "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+                },
+                "scouting": {"multicast": {"enabled": False}},
+                "timestamping": {"enabled": True},
+                "transport": {
+                    "link": {
+                        "rx": {"max_message_size": _MAX_MESSAGE_BYTES},
+                        "tx": {"queue": {"size": {"data": _QUEUED_BATCHES}, "congestion_control": _PATIENCE}},
+                    }
+                },
+            }
+        )
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:300]
+
+
+class Subscription:
+    """Puts what arrives on some names into an inbox; a context manager.
+
+    Callbacks run in zenoh's own threads and do as little as they can. Our own outputs are not taken for
+    events, whatever wildcard matches them.
+
+    Args:
+        session: open; not closed here.
+        names: of the topics.
+        inbox: filled.
+        reliable: use zenoh's advanced subscriber, which recovers what was missed and asks for history; works
+            with publishers that do the same.
+    """
+
+    def __init__(self, session: zenoh.Session, names: Names, inbox: Inbox, *, reliable: bool = False) -> None:
+        """Subscribe.
+
+        Raises:
+            InputError: zenoh refuses a key expression.
+        """
+        self._names = names
+        self._inbox = inbox
+        self._publishers: Counter[str] = Counter()
+        self._open: list[object] = []
+        try:
+            # First the tokens: who leaves was there before.
+            self._open.append(
+                session.liveliness().declare_subscriber(
+                    names.tokens, Callback(self._on_token, indirect=False), history=True
+                )
+            )
+            for expression in names.subscriptions:
+                self._open.append(self._subscribe(session, expression, reliable))
+            if isinstance(names, RosNames):
+                self._announce(session, names)
+        except zenoh.ZError as error:
+            self.close()
+            raise InputError(
+                f"{names.subscriptions[0]!r} is no key expression: {_first_line(error)}"
+            ) from None
+
+    def __enter__(self) -> Self:
+        """Give the subscription itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Unsubscribe."""
+        self.close()
+
+    def close(self) -> None:
+        """Unsubscribe; what is in the inbox stays there."""
+        for declared in reversed(self._open):
+            declared.undeclare()  # type: ignore[attr-defined]
+        self._open.clear()
+
+    def _subscribe(self, session: zenoh.Session, expression: str, reliable: bool) -> object:
+        callback = Callback(self._on_sample, indirect=False)
+        if not reliable:
+            return session.declare_subscriber(expression, callback)
+        return zenoh.ext.declare_advanced_subscriber(
+            session,
+            expression,
+            callback,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_HISTORY),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+
+    def _announce(self, session: zenoh.Session, names: RosNames) -> None:
+        zid = str(session.zid())
+        liveliness = session.liveliness()
+        tokens = [ros_entity_token(names.domain, zid, 0, "NN", "streamfeat_listener")]
+        if "*" not in names.expression:
+            subscribed = (names.expression, EVENT_SCHEMAS[0])
+            tokens.append(ros_entity_token(names.domain, zid, 10, "MS", "streamfeat_listener", *subscribed))
+        self._open += [liveliness.declare_token(token) for token in tokens]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        topic = self._names.topic(key)
+        if sample.kind != zenoh.SampleKind.PUT or topic.rpartition("/")[2] in OUTPUTS:
+            return
+        size = len(sample.payload)
+        problem = "too large" if size > MAX_PAYLOAD_BYTES else ""
+        attachment = sample.attachment
+        attached = attachment.to_bytes() if attachment and len(attachment) <= ATTACHMENT_BYTES else b""
+        self._inbox.put(
+            RawMessage(
+                topic,
+                self._names.schema(key, str(sample.encoding)) or "",
+                b"" if problem else sample.payload.to_bytes(),
+                attached,
+                time.monotonic_ns(),
+                time.time_ns(),
+                problem,
+            )
+        )
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        topic = self._names.token_topic(str(sample.key_expr))
+        if not topic:
+            return
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._publishers[topic] += 1
+            return
+        self._publishers[topic] -= 1
+        if self._publishers[topic] <= 0:
+            del self._publishers[topic]
+            self._inbox.put(Gone(topic))
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class FoundTopic:
+    """A topic that somebody publishes events on.
+
+    Attributes:
+        name: key, or ROS 2 topic.
+        kind: `zenoh` or `ros2`.
+        domain: of ROS 2; -1 for plain zenoh.
+        publishers: how many.
+    """
+
+    name: str
+    kind: str
+    domain: int
+    publishers: int
+
+
+def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic]:
+    """Listen to who publishes events; publishers of plain keys are found if they declare a token.
+
+    Args:
+        session: open.
+        seconds: how long; sessions need some milliseconds to find one another.
+    """
+    tokens: dict[str, None] = {}
+
+    def on_token(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            tokens[str(sample.key_expr)] = None
+        else:
+            tokens.pop(str(sample.key_expr), None)
+
+    plain, ros = PlainNames("**"), RosNames("/any")
+    expressions = (plain.tokens, ros.tokens.replace(f"/{ros.domain}/", "/*/", 1))
+    callback = Callback(on_token, indirect=False)
+    watching = [
+        session.liveliness().declare_subscriber(expression, callback, history=True)
+        for expression in expressions
+    ]
+    time.sleep(seconds)
+    for one in watching:
+        one.undeclare()  # type: ignore[no-untyped-call]
+    found: Counter[tuple[str, str, int]] = Counter()
+    for token in list(tokens):
+        if token.startswith("@ros2_lv/"):
+            domain = token.split("/")[1]
+            topic = ros.token_topic(token)
+            if topic and domain.isdecimal():
+                found[topic, "ros2", int(domain)] += 1
+        else:
+            found[plain.token_topic(token), "zenoh", -1] += 1
+    return sorted(FoundTopic(*which, n) for which, n in found.items())

@@ -1,0 +1,153 @@
+"""Recordings as live cameras.
+
+Lives here: one or several recordings played to topics, at their pace or another, once or for ever.
+Not here: reading (`recording`), pacing (`pipeline`), the network (`network`, `publisher`).
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from streamfeat.errors import InputError
+from streamfeat.live.names import Names
+from streamfeat.live.network import DEFAULT_PORT, open_session
+from streamfeat.live.publisher import CameraSink
+from streamfeat.messages import EventPacket, LabelMessage
+from streamfeat.packets import Label, Packet, PacketWriter
+from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.recording import Recording, open_recording
+from streamfeat.sinks import open_sinks
+
+__all__ = ["Publish"]
+
+_LOOP_GAP_US = 1_000_000
+_POLL_S = 0.01
+
+
+class Publish:
+    """Plays recordings to topics, each on its own.
+
+    Args:
+        sources: recordings, with the topic of each.
+        names: how topics are called.
+        speed: stream seconds for each second of the clock; None for as fast as readers take it.
+        loop: start again at the end, with times that go on.
+        encoding: of the payloads.
+        reliable: keep packets for readers that missed them.
+        wait_s: how long to wait for somebody to subscribe.
+        zenoh_config: JSON5 file; without it, this machine alone.
+        port: where sessions on this machine meet.
+
+    Raises:
+        InputError: a recording cannot be read, or an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        sources: list[tuple[Path, str]],
+        names: Names,
+        *,
+        speed: float | None = 1.0,
+        loop: bool = False,
+        encoding: str = "mono",
+        reliable: bool = False,
+        wait_s: float = 1.0,
+        zenoh_config: Path | None = None,
+        port: int = DEFAULT_PORT,
+    ) -> None:
+        """Check the arguments."""
+        topics = [topic for _, topic in sources]
+        if len(set(topics)) < len(topics) or any("*" in topic for topic in topics):
+            raise InputError(f"each recording needs a topic of its own, without wildcards, not {topics}")
+        for path, _ in sources:
+            open_recording(path).close()
+        PacketWriter(encoding)
+        self._sources, self._names = sources, names
+        self._speed, self._loop, self._encoding = speed, loop, encoding
+        self._reliable, self._wait_s = reliable, wait_s
+        self._zenoh_config, self._port = zenoh_config, port
+        self._cutters: list[_Cutter] = []
+        self._sinks: list[CameraSink] = []
+        self._seconds = 0.0
+        self.interrupted = False
+
+    def run(self) -> None:
+        """Publish to the end, or to the first SIGINT or SIGTERM."""
+        # Only those without a pace of their own can wait for readers; a camera cannot.
+        options = {"block": self._speed is None, "reliable": self._reliable}
+        with open_session(self._zenoh_config, port=self._port) as session, ExitStack() as recordings:
+            self._sinks = open_sinks(
+                *(partial(CameraSink, session, self._names, topic, **options) for _, topic in self._sources)
+            )
+            self._cutters = [_Cutter(self._encoding) for _ in self._sources]
+            pipelines: list[Pipeline[Packet | Label, EventPacket | LabelMessage]] = []
+            for (path, topic), cutter, sink in zip(self._sources, self._cutters, self._sinks, strict=True):
+                _wait_for_readers(session, self._names.key(topic, EventPacket.SCHEMA_NAME), self._wait_s)
+                items = _items(recordings.enter_context(open_recording(path)), loop=self._loop)
+                pipelines.append(Pipeline(items, cutter, [sink], speed=self._speed))
+            started = time.perf_counter()
+            self.interrupted = run_until_interrupted(pipelines)
+            self._seconds = time.perf_counter() - started
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        events = sum(cutter.events for cutter in self._cutters)
+        return {
+            "topics": ", ".join(topic for _, topic in self._sources),
+            "packets": sum(sink.events.seq for sink in self._sinks),
+            "events": events,
+            "bytes": sum(sink.n_bytes for sink in self._sinks),
+            "seconds": round(self._seconds, 3),
+            "events_per_s": round(events / max(self._seconds, 1e-9)),
+            "interrupted": self.interrupted,
+        }
+
+
+class _Cutter:
+    """Turns packets and labels into messages."""
+
+    def __init__(self, encoding: str) -> None:
+        self._writer = PacketWriter(encoding)
+        self.events = 0
+
+    def process(self, item: Packet | Label) -> Iterator[EventPacket | LabelMessage]:
+        if isinstance(item, Packet):
+            yield from self._writer.messages(item.events, item.resolution)
+            self.events += len(item.events)
+        else:
+            stamp_ns, duration_ns = item.start_us * 1000, item.duration_us * 1000
+            yield LabelMessage(stamp_ns, "", duration_ns, item.label, item.split, item.source)
+
+    def finish(self) -> Iterator[EventPacket | LabelMessage]:
+        yield from ()
+
+
+def _items(recording: Recording, *, loop: bool) -> Iterator[Packet | Label]:
+    yield from recording.items()
+    if not loop or recording.first_us is None or recording.last_us is None:
+        return
+    step_us = recording.last_us - recording.first_us + _LOOP_GAP_US
+    shift_us = 0
+    while True:
+        shift_us += step_us
+        for item in recording.items():
+            if isinstance(item, Packet):
+                events = item.events.copy()
+                events["t"] += shift_us
+                yield replace(item, events=events)
+            else:
+                yield replace(item, start_us=item.start_us + shift_us)
+
+
+def _wait_for_readers(session: zenoh.Session, key: str, seconds: float) -> None:
+    with session.declare_publisher(key) as probe:
+        until = time.monotonic() + seconds
+        # A status is an object, whatever its type hint says.
+        while not probe.matching_status.matching and time.monotonic() < until:  # type: ignore[attr-defined]
+            time.sleep(_POLL_S)

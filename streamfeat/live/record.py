@@ -1,0 +1,205 @@
+"""Live topics to a recording that survives a crash.
+
+Lives here: which messages are recorded, and how often they are made safe.
+Not here: writing (`recorder`), the network (`network`).
+
+Messages are written as they came. Every `chunk_s` seconds what was written is closed as a chunk and handed to
+the operating system, so a process that is killed at any byte loses what came after that, and nothing before.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+
+from streamfeat.cameras import Gone
+from streamfeat.errors import InputError
+from streamfeat.live.delivery import Delivery, DeliveryStats
+from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.intake import MAX_TOPICS, Warnings
+from streamfeat.live.names import Attachment, Names
+from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.messages import EventArray, EventPacket, LabelMessage
+from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.recorder import RecordingWriter
+from streamfeat.sinks import open_sinks
+
+__all__ = ["Record"]
+
+_POLL_S = 0.05
+_MESSAGES = {kind.SCHEMA_NAME: kind for kind in (EventPacket, EventArray, LabelMessage)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Flush:
+    """Time to make safe what was written."""
+
+
+class Record:
+    """Records topics until `stop` or a signal.
+
+    Args:
+        names: of the topics; labels beside them are recorded too.
+        target: MCAP file; until the end it is `<target>.part`.
+        compression: of chunks.
+        chunk_s: seconds that a crash can cost.
+        overwrite: whether an existing file may be replaced.
+        reliable: recover missed packets, from publishers that do the same.
+        zenoh_config: JSON5 file; without it, this machine alone.
+        port: where sessions on this machine meet.
+        console: for warnings.
+
+    Raises:
+        InputError: an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        names: Names,
+        target: Path,
+        *,
+        compression: Literal["zstd", "lz4", "none"] = "lz4",
+        chunk_s: float = 0.5,
+        overwrite: bool = False,
+        reliable: bool = False,
+        zenoh_config: Path | None = None,
+        port: int = DEFAULT_PORT,
+        console: Console | None = None,
+    ) -> None:
+        """Check the arguments."""
+        if not 0.01 <= chunk_s <= 3600:
+            raise InputError(f"a chunk of {chunk_s} s is not possible; give 0.01 to 3600")
+        self._names, self._target = names, target
+        self._compression, self._chunk_s, self._overwrite = compression, chunk_s, overwrite
+        self._reliable, self._zenoh_config, self._port = reliable, zenoh_config, port
+        self._inbox = Inbox()
+        self._warnings = Warnings.on(console)
+        self._topics: dict[str, Delivery] = {}
+        self._written: Counter[str] = Counter()
+        self._bytes = 0
+        self._seconds = 0.0
+        self.interrupted = False
+
+    def run(self) -> None:
+        """Record until `stop`, SIGINT or SIGTERM; what has arrived by then is written.
+
+        Raises:
+            InputError: the file cannot be written, or the network not be used.
+        """
+        with open_session(self._zenoh_config, port=self._port) as session:
+            (sink,) = open_sinks(
+                lambda: _MessageSink(
+                    RecordingWriter(
+                        self._target,
+                        compression=self._compression,
+                        overwrite=self._overwrite,
+                        keep_partial=True,
+                    )
+                )
+            )
+            pipeline: Pipeline[RawMessage | _Flush, RawMessage | _Flush] = Pipeline(
+                self._items(), _Unchanged(), [sink]
+            )
+            started = time.monotonic()
+            with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+                self.interrupted = run_until_interrupted([pipeline], self.stop)
+            self._seconds = time.monotonic() - started
+
+    def stop(self) -> None:
+        """Take in no more; may be called from any thread."""
+        self._inbox.close()
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        delivery = sum((topic.stats for topic in self._topics.values()), DeliveryStats())
+        return {
+            "written": str(self._target),
+            "topics": ", ".join(sorted(self._written)),
+            "messages": self._written.total(),
+            "bytes": self._bytes,
+            "seconds": round(self._seconds, 3),
+            "lost": delivery.lost,
+            "unheard": delivery.unheard,
+            "dropped": self._inbox.dropped,
+            "duplicates": delivery.duplicates,
+            "restarts": delivery.restarts,
+            "warnings": dict(sorted(self._warnings.counts.items())),
+            "interrupted": self.interrupted,
+        }
+
+    def _items(self) -> Iterator[RawMessage | _Flush | None]:
+        due = time.monotonic() + self._chunk_s
+        while (taken := self._inbox.take(min(_POLL_S, self._chunk_s))) is not None:
+            for message in taken:
+                if isinstance(message, Gone):
+                    if message.topic in self._topics:
+                        self._topics[message.topic].left()
+                elif self._is_wanted(message):
+                    self._written[message.topic] += 1
+                    self._bytes += len(message.payload)
+                    yield message
+            if time.monotonic() >= due:
+                due = time.monotonic() + self._chunk_s
+                yield _Flush()
+            yield None
+
+    def _is_wanted(self, message: RawMessage) -> bool:
+        """Whether it is a message of ours that did not come before; says what is missing."""
+        kind = _MESSAGES.get(message.schema)
+        if message.problem or kind is None:
+            self._warnings.add(message.problem or "unknown type", message.topic, message.schema[:80])
+            return False
+        try:
+            content = kind.from_cdr(message.payload)
+        except InputError as error:
+            self._warnings.add("bad message", message.topic, str(error))
+            return False
+        attachment = Attachment.unpack(message.attachment)
+        if isinstance(content, LabelMessage) or (attachment is None and not isinstance(content, EventPacket)):
+            return True
+        if message.topic not in self._topics and len(self._topics) >= MAX_TOPICS:
+            self._warnings.add("too many topics", message.topic, f"{MAX_TOPICS} are recorded already")
+            return False
+        delivery = self._topics.setdefault(message.topic, Delivery())
+        seq = content.seq if isinstance(content, EventPacket) else 0
+        gid, seq = (attachment.gid, attachment.seq) if attachment else (b"", seq)
+        verdict = delivery.see(gid, seq, message.arrived_ns, message.dropped)
+        if verdict.lost:
+            self._warnings.add("packets missing", message.topic, f"{verdict.lost} before number {seq}")
+        return verdict.use
+
+
+class _Unchanged:
+    """The processor that does nothing."""
+
+    def process(self, item: RawMessage | _Flush) -> Iterator[RawMessage | _Flush]:
+        yield item
+
+    def finish(self) -> Iterator[RawMessage | _Flush]:
+        yield from ()
+
+
+class _MessageSink:
+    """Writes messages as they came."""
+
+    def __init__(self, writer: RecordingWriter) -> None:
+        self._writer = writer
+
+    def write(self, messages: Sequence[RawMessage | _Flush]) -> None:
+        for message in messages:
+            if isinstance(message, _Flush):
+                self._writer.flush()
+                continue
+            attachment = Attachment.unpack(message.attachment)
+            topic = "/" + message.topic.lstrip("/")
+            kind = _MESSAGES[message.schema]
+            seq = attachment.seq if attachment else 0
+            self._writer.write_message(topic, kind, message.payload, message.log_time_ns, seq & 0xFFFFFFFF)
+
+    def close(self, *, failed: bool) -> None:
+        error = InputError("abandoned") if failed else None
+        self._writer.__exit__(type(error) if error else None, error, None)

@@ -1,0 +1,174 @@
+"""TLS with certificates on both sides, and who may do what by the name in them, all from zenoh's own file."""
+
+import datetime
+import ipaddress
+import json
+
+import pytest
+import tiny
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from live_net import Collector, attachment, free_port, running, until
+from test_live_listen import MODEL, message
+
+from streamfeat.live.listen import Listen
+from streamfeat.live.names import PlainNames
+from streamfeat.live.network import open_session
+
+RULES = """{
+  mode: "peer",
+  listen: { endpoints: ["tls/127.0.0.1:PORT"] },
+  scouting: { multicast: { enabled: false }, gossip: { enabled: false } },
+  transport: { link: { tls: {
+    enable_mtls: true,                              // clients need a certificate of our authority, too
+    root_ca_certificate: "FOLDER/ca.pem",
+    listen_certificate: "FOLDER/robot.pem",
+    listen_private_key: "FOLDER/robot.key",
+  } } },
+  access_control: {
+    enabled: true,
+    default_permission: "deny",
+    rules: [
+      { id: "give events", permission: "allow", flows: ["ingress"],
+        messages: ["put", "liveliness_token"], key_exprs: ["robot/*/events", "robot/*/events/@events/*"] },
+      { id: "be asked for events", permission: "allow", flows: ["egress"],
+        messages: ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"],
+        key_exprs: ["robot/*/events", "robot/*/label", "robot/*/events/@events/*"] },
+      { id: "ask for results", permission: "allow", flows: ["ingress"],
+        messages: ["declare_subscriber"], key_exprs: ["robot/*/features", "robot/*/prediction"] },
+      { id: "get results", permission: "allow", flows: ["egress"],
+        messages: ["put"], key_exprs: ["robot/*/features", "robot/*/prediction"] },
+    ],
+    subjects: [
+      { id: "camera", cert_common_names: ["camera"] },
+      { id: "operator", cert_common_names: ["operator"] },
+    ],
+    policies: [
+      { rules: ["give events", "be asked for events"], subjects: ["camera"] },
+      { rules: ["ask for results", "get results"], subjects: ["operator"] },
+    ],
+  },
+}"""
+"""The example of the README."""
+
+
+class Authority:
+    """A certificate authority that lives in a folder."""
+
+    def __init__(self, folder, name="ca"):
+        self.folder = folder
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+        basic = x509.BasicConstraints(ca=True, path_length=0)
+        self._write(name, self._key, self._sign(self._name, self._key, basic))
+
+    def issue(self, name):
+        """Write `name.pem` and `name.key`, for 127.0.0.1."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+        address = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
+        self._write(name, key, self._sign(subject, key, address))
+
+    def _sign(self, subject, key, extension):
+        now = datetime.datetime.now(datetime.UTC)
+        builder = x509.CertificateBuilder(self._name, subject, key.public_key(), x509.random_serial_number())
+        builder = builder.not_valid_before(now - datetime.timedelta(hours=1))
+        builder = builder.not_valid_after(now + datetime.timedelta(hours=1))
+        return builder.add_extension(extension, critical=False).sign(self._key, hashes.SHA256())
+
+    def _write(self, name, key, certificate):
+        (self.folder / f"{name}.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        (self.folder / f"{name}.key").write_bytes(
+            key.private_bytes(
+                serialization.Encoding.PEM,
+                serialization.PrivateFormat.PKCS8,
+                serialization.NoEncryption(),
+            )
+        )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Certificates of one authority, and those of another."""
+    folder = tmp_path_factory.mktemp("certificates")
+    authority = Authority(folder)
+    for name in ("robot", "camera", "operator", "stranger"):
+        authority.issue(name)
+    (folder / "other").mkdir()
+    Authority(folder / "other").issue("camera")
+    MODEL.save(folder / "model")
+    return folder
+
+
+def client(port, folder, name, authority=None):
+    """The configuration of somebody who connects, as a file."""
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [f"tls/127.0.0.1:{port}"], "timeout_ms": 500, "exit_on_failure": True},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {
+            "link": {
+                "tls": {
+                    "root_ca_certificate": str((authority or folder) / "ca.pem"),
+                    "enable_mtls": True,
+                    "connect_certificate": str(folder / f"{name}.pem"),
+                    "connect_private_key": str(folder / f"{name}.key"),
+                }
+            }
+        },
+    }
+    path = folder / f"{name}.json5"
+    path.write_text(json.dumps(config))
+    return path
+
+
+def test_certificates_and_access_control(folder):
+    port = free_port()
+    config = folder / "robot.json5"
+    config.write_text(RULES.replace("PORT", str(port)).replace("FOLDER", str(folder)))
+    job = Listen(
+        PlainNames("robot/*/events"),
+        folder / "model",
+        emit="10ms",
+        zenoh_config=config,
+        silence_s=1e9,
+        patience_s=1e9,
+        max_delay_s=1e9,
+    )
+    events = [tiny.steady(i * 10_000, (i + 1) * 10_000, 50, seed=i) for i in range(20)]
+    key = "robot/cam0/events"
+    with running(job):
+        camera = until(lambda: _try_open(client(port, folder, "camera")), "the camera's connection")
+        with (
+            camera,
+            open_session(client(port, folder, "operator")) as operator,
+            # Of the right authority, but with no right to anything.
+            open_session(client(port, folder, "stranger")) as stranger,
+            camera.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK) as source,
+        ):
+            overheard, read = Collector(stranger, "robot/**"), Collector(operator, "robot/*/features")
+            for i in range(5):
+                stranger.put(key, message(events[i], i), attachment=attachment(i + 1, b"s" * 16))
+                operator.put(key, message(events[i], i), attachment=attachment(i + 1, b"o" * 16))
+            until(lambda: source.matching_status.matching)
+            for i, batch in enumerate(events):
+                source.put(message(batch, i), attachment=attachment(i + 1, b"c" * 16))
+            until(lambda: job.result()["packets"] == 20)
+            until(lambda: len(read.samples) >= 19)
+            assert overheard.samples == []
+        # Of another authority: refused at the handshake, and the other way round it does not trust us.
+        with pytest.raises(Exception, match="zenoh cannot use this configuration"):
+            open_session(client(port, folder / "other", "camera", folder))
+        with pytest.raises(Exception, match="zenoh cannot use this configuration"):
+            open_session(client(port, folder / "other", "camera"))
+    result = job.result()
+    assert (result["events"], result["foreign"], result["lost"], result["warnings"]) == (1000, 0, 0, {})
+
+
+def _try_open(config):
+    try:
+        return open_session(config)
+    except ValueError:
+        return None
