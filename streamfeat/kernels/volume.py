@@ -143,9 +143,10 @@ def gather_volume(
             break
         plane = ring[(first_slot + position) % n_bins]
         for row in range(top, top + patch):
-            for column in range(left, left + patch):
-                values[i] = plane[row, column]
-                i += 1
+            pixels, copies = plane[row, left : left + patch], values[i : i + patch]
+            for column in range(patch):
+                copies[column] = pixels[column]
+            i += patch
     values[end:] = 0
 
 

@@ -76,8 +76,8 @@ def _at(*keys: str) -> Callable[[dict[str, Any]], Found]:
 
 def _tail(percentile: str) -> Callable[[dict[str, Any]], Found]:
     def find(part: dict[str, Any]) -> Found:
-        """As under `--emit event`, which looks ahead."""
-        update = part["looking ahead"]["update"]
+        """As under `--emit event`, which looks ahead; every event of every run."""
+        update = part["looking ahead"]["as they came"]
         return float(update[f"{percentile}_ns"] / update["p50_ns"])
 
     return find
