@@ -22,7 +22,7 @@ class Emission:
     """One reading of the features, with the prediction that follows from it.
 
     Attributes:
-        t_us: stream time; the reading reflects every event before it.
+        t_us: stream time; the reading reflects every event before it that has arrived.
         n_events: events counted by the session so far.
         features: `(n_features,)` float32.
         labels: names that the scores belong to; empty without a classifier.

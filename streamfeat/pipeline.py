@@ -42,7 +42,7 @@ _EVENTS_A_HOP = 32_768
 """Items are handed on in groups of about so many events: a hop between threads costs 50 to 100 us."""
 _EMISSIONS_A_HOP = 256
 _PACED_SLICE_US = 10_000
-"""At recorded pace packets are cut to this length, so that nothing waits for the end of a long packet."""
+"""Paced packets are cut to this length of the clock, so that nothing waits for the end of a long packet."""
 
 
 @dataclass(slots=True)
@@ -131,8 +131,10 @@ class Pipeline(Generic[In, Out]):
 
     async def _read(self, threads: ThreadPoolExecutor) -> None:
         loop = asyncio.get_running_loop()
-        paced = self._speed is not None
-        groups = iter(_paced_groups(self._items) if paced else _full_groups(self._items))
+        if self._speed is None:
+            groups = _full_groups(self._items)
+        else:
+            groups = _paced_groups(self._items, round(_PACED_SLICE_US * max(self._speed, 1.0)))
         started: tuple[float, int] | None = None
         while not self._stop.is_set():
             group = await loop.run_in_executor(threads, next, groups, None)
@@ -258,7 +260,7 @@ def _full_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
         yield group
 
 
-def _paced_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
+def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[list[In]]:
     for item in items:
         if item is None:
             continue
@@ -268,7 +270,7 @@ def _paced_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
         latest = np.maximum.accumulate(item.events["t"])
         start = 0
         while start < len(latest):
-            stop = int(np.searchsorted(latest, latest[start] + _PACED_SLICE_US))
+            stop = int(np.searchsorted(latest, latest[start] + slice_us))
             yield [replace(item, events=item.events[start:stop])]
             start = stop
 

@@ -3,7 +3,7 @@
 Lives here: running the real pipeline at the pace of the recording, with a watch at both ends.
 Not here: the pipeline itself, which is not changed and not told; a single update (`update`).
 
-At recorded pace the pipeline hands on packets, cut to at most 10 ms of stream time, when their latest event
+At recorded pace the pipeline hands on packets, cut to at most 10 ms of the clock, when their latest event
 is due by the clock. A latency is the time from there until an emission that reflects this packet is handed
 to the sink. In it: waiting in both queues, two changes of thread on either side, feeding, reading, and, under
 `event`, the 256 emissions that travel together. Not in it: what happens before a packet is complete (an event
