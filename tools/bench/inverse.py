@@ -71,7 +71,7 @@ def _measure(setting: Setting, share: float) -> dict[str, Any]:
     for name, options in {
         "lasso_cd": {"alpha": encoder.threshold},
         "lasso_lars": {"alpha": encoder.threshold},
-        "omp": {"n_nonzero_coefs": used},
+        "omp": {"n_nonzero_coefs": max(used, 1)},
     }.items():
         contestants[f"scikit-learn {name}"], codes = problems.scikit(name, options)
         if name != "omp":

@@ -286,7 +286,7 @@ def encoder_of(
             formulation=formulation,
             encoding=encoding,
             n_filters=n_filters,
-            n_volumes=200 if setting.quick else 6000,
+            n_volumes=1_500 if setting.quick else 6000,
             max_iter=1 if setting.quick else 3,
         )
     setting.models.mkdir(parents=True, exist_ok=True)
