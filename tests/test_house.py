@@ -15,7 +15,14 @@ PACKAGE = Path(streamfeat.__file__).parent
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
     {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine"},
-    {"kernels.code", "kernels.decode", "kernels.ingest", "kernels.lasso", "kernels.volume"},
+    {
+        "kernels.code",
+        "kernels.decode",
+        "kernels.ingest",
+        "kernels.lasso",
+        "kernels.volume",
+        "kernels.surfaces",
+    },
     {"kernels.encode", "codecs", "safe_arrays"},
     {"kernels.planes"},
     {"kernels.update"},
@@ -27,7 +34,7 @@ LAYERS = [
     {"session"},
     {"pipeline"},
     {"replay"},
-    {"latency"},
+    {"evaluate", "latency"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -42,7 +49,13 @@ ROOMS = {
     ],
     "foreign": [{"words"}, {"tables"}, {"containers"}, {"event_files"}, {"datasets"}],
     "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
-    "cli": [{"program"}, {"learning", "measuring", "recordings", "streaming"}],
+    "evaluate": [
+        {"plan", "published", "scores", "splits", "surfaces"},
+        {"methods", "words"},
+        {"cell", "page"},
+        {"run"},
+    ],
+    "cli": [{"program"}, {"evaluating", "learning", "measuring", "recordings", "streaming"}],
 }
 """The same inside packages that are one place in the layers."""
 
@@ -50,9 +63,16 @@ ONLY_IN = {
     "asyncio": {"pipeline", "replay", "latency.hop"},
     "mcap": {"mcap_records", "recording", "recorder"},
     "zenoh": {"live"},
-    "typer": {"cli.program", "cli.recordings", "cli.learning", "cli.measuring", "cli.streaming"},
+    "typer": {
+        "cli.program",
+        "cli.evaluating",
+        "cli.recordings",
+        "cli.learning",
+        "cli.measuring",
+        "cli.streaming",
+    },
     "hdrh": {"latency.histogram"},
-    "bokeh": {"report", "latency.picture"},
+    "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
 }

@@ -10,11 +10,11 @@ from typing import NoReturn
 
 from rich.markup import escape
 
-from streamfeat.cli import learning, measuring, recordings, streaming
+from streamfeat.cli import evaluating, learning, measuring, recordings, streaming
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
-__all__ = ["app", "learning", "main", "measuring", "recordings", "streaming"]
+__all__ = ["app", "evaluating", "learning", "main", "measuring", "recordings", "streaming"]
 
 
 def main() -> NoReturn:
