@@ -162,7 +162,8 @@ def _print(result: dict[str, Any]) -> None:
         sweep_tables,
     )
 
-    _show("accuracy", COLUMNS, [cells(row) for row in base_rows(result)], left=(0, 2))
+    columns = [column.replace(", ", ",\n").replace("% ", "%\n") for column in COLUMNS]
+    _show("accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
     for name, (header, rows) in sweep_tables(result):
         _show(f"sweep of {name.replace('_', ' ')}", header, rows)
     header, rows = early_table(result)
@@ -182,8 +183,7 @@ def _show(
 ) -> None:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for i, column in enumerate(header):
-        name = column.replace(", ", ",\n") if len(header) > 5 else column
-        table.add_column(escape(name), justify="left" if i in left else "right", no_wrap=i in left)
+        table.add_column(escape(column), justify="left" if i in left else "right", no_wrap=True)
     for row in rows:
         table.add_row(*map(escape, row))
     out.print(table)

@@ -29,10 +29,10 @@ COLUMNS = (
     "features",
     "accuracy",
     "95 % interval",
-    "learning, s",
-    "encoding, s",
-    "training, s",
-    "memory, MB",
+    "learn, s",
+    "encode, s",
+    "train, s",
+    "peak, MB",
 )
 
 
@@ -59,11 +59,11 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def _geometry(setting: dict[str, Any]) -> str:
-    return f"{setting['patch']}x{setting['patch']}x{setting['bins']}, stride {setting['stride']}"
+    return f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
 
 
 def _interval(row: dict[str, Any]) -> str:
-    return f"{row['low']:.3f} to {row['high']:.3f}"
+    return f"{row['low']:.3f}-{row['high']:.3f}"
 
 
 def sweep_tables(result: dict[str, Any]) -> Iterator[tuple[str, Lines]]:
@@ -131,12 +131,12 @@ def notes(result: dict[str, Any]) -> list[str]:
         f"{', '.join(result['recordings'])}: {samples['training']:,} samples to learn from, "
         f"{samples['held_out']:,} held out; split: {result['split']}; {result['interval']}.",
         "Every method's features go through the same normalisation and linear SVM. Encoding is of all "
-        "samples, training with the choice of C; memory is the peak of the whole process in that run.",
+        "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
     setting = next((row["setting"] for row in base_rows(result) if row["setting"]), None)
     if setting:
         lines.append(
-            f"Geometry is patch x patch x bins, in pixels; downsample {setting['downsample']}, counts "
+            f"Geometry is patch x patch x bins/stride, in pixels; downsample {setting['downsample']}, counts "
             f"clipped to {setting['max_count']}, {setting['encoding']} encoding, "
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "
             "Filters are learned without labels, from samples that are not held out."
