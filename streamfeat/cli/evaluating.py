@@ -89,6 +89,8 @@ def evaluate(
 
     if early_samples < 0:
         raise InputError(f"--early-samples {early_samples} is not possible; give 0 or more")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed {seed} is not possible; give 0 to 2^32 - 1")
     for path in (output, page):
         if path:
             refuse_existing(path, overwrite=overwrite)

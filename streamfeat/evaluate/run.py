@@ -96,9 +96,9 @@ def _line(record: dict[str, Any]) -> bytes:
 def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
     try:
         record = json.loads(line)
-        if number and not {"cell", "result"} <= record.keys():
+        if number and not (record["cell"] and record["result"].keys() >= {"right", "samples", "confusion"}):
             raise ValueError("it is not a finished cell")
-    except (ValueError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: line {number + 1} cannot be read ({error}); delete the file") from error
     return dict(record)
 

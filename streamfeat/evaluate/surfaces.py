@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 from sklearn.cluster import MiniBatchKMeans
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
 from streamfeat.recording import HELD_OUT_SPLITS, Recording, Sample
 
 __all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
+
+_FITTED_SAMPLES = 1_000
+"""Training samples whose surfaces prototypes are learned from: enough for so few prototypes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,18 +130,27 @@ class SurfaceHistogram:
     def fitted(
         cls, recordings: Sequence[Recording], n_prototypes: int = 64, n_surfaces: int = 50_000, seed: int = 0
     ) -> "SurfaceHistogram":
-        """Prototypes of the surfaces at random events of training samples."""
+        """Prototypes of the surfaces at random events of random training samples.
+
+        Raises:
+            InputError: there is no event.
+        """
         rng = np.random.default_rng(seed)
         n_samples = sum(
             label.split not in HELD_OUT_SPLITS for recording in recordings for label in recording.labels
         )
-        each = -(-n_surfaces // max(n_samples, 1))
+        chosen = set(rng.permutation(n_samples)[:_FITTED_SAMPLES].tolist())
+        each = -(-n_surfaces // max(len(chosen), 1))
         blank = cls(np.zeros((0, 0), np.float32))
         drawn = []
-        for sample in _training(recordings):
+        for i, sample in enumerate(_training(recordings)):
+            if i not in chosen:
+                continue
             surfaces = blank._surfaces(*_until(sample.events, sample.resolution), sample.resolution)
             if len(surfaces):
                 drawn.append(surfaces[rng.integers(0, len(surfaces), each)])
+        if not drawn:
+            raise InputError("the training samples have no events; hots has nothing to learn from")
         means = MiniBatchKMeans(n_prototypes, batch_size=4096, n_init=1, random_state=seed)
         with threadpool_limits(1, user_api="openmp"):
             means.fit(np.concatenate(drawn))
@@ -180,7 +193,7 @@ class SurfaceHistogram:
         latest = np.full((2, resolution[0] + side - 1, resolution[1] + side - 1), -np.inf)
         out = np.empty((len(t), 2, side, side), np.float32)
         time_surfaces(x, y, p, t / self.tau_us, latest, out)
-        return out.reshape(len(t), -1)
+        return out.reshape(len(t), 2 * side * side)
 
 
 def _training(recordings: Sequence[Recording]) -> Iterator[Sample]:
