@@ -443,7 +443,7 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     output, page = tmp_path / "result.json", tmp_path / "result.html"
     every = [argument for method in METHODS for argument in ("--method", method)]
     run = invoke(
-        animals, *QUICK, *every, "--sweep", "filters=12,1000", "--sweep", "patch=6", "--volumes", "2000",
+        animals, *QUICK, *every, "--sweep", "filters=12,14", "--sweep", "patch=3",
         "--early-samples", "4", "-o", output, "--report", page, "--json",
     )  # fmt: skip
     assert run.exit_code == 0, run.output
