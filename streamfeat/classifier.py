@@ -16,7 +16,7 @@ from sklearn.model_selection import GridSearchCV, StratifiedKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from streamfeat.encoder import Encoder
+from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.safe_arrays import read_safetensors, write_safetensors
 from streamfeat.svm import LinearSVM
@@ -81,7 +81,7 @@ class Classifier:
         object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
 
     @classmethod
-    def untrained(cls, labels: Sequence[str], encoder: Encoder) -> Self:
+    def untrained(cls, labels: Sequence[str], encoder: FeatureMap) -> Self:
         """A classifier of zeros, for learning online from nothing.
 
         Raises:
@@ -176,7 +176,7 @@ class Classifier:
 def train_classifier(
     features: NDArray[np.float32],
     labels: Sequence[str],
-    encoder: Encoder,
+    encoder: FeatureMap,
     *,
     candidates: Sequence[float] = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1),
     folds: int = 3,

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from streamfeat.operator import check_operator, fixed_fields, n_features, quanti
 from streamfeat.safe_arrays import one_line, read_safetensors, write_safetensors
 from streamfeat.window import encode_window
 
-__all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "Formulation"]
+__all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
 
 FORMAT_VERSION = 1
 
@@ -33,6 +33,28 @@ Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
 
 _LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
+
+
+class FeatureMap(Protocol):
+    """What turns the events of one window into features: an encoder, or what it is compared with."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Of everything that decides what features are."""
+
+    @property
+    def n_features(self) -> int:
+        """Length of a feature vector."""
+
+    def encode(
+        self,
+        events: Events,
+        resolution: Resolution,
+        *,
+        origin_us: int | None = None,
+        t_us: int | None = None,
+    ) -> NDArray[np.float32]:
+        """Features of one window; see `Encoder.encode`."""
 
 
 @dataclass(frozen=True, slots=True)

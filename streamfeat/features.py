@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 
-from streamfeat.encoder import Encoder
+from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.recording import Label, Sample
 
@@ -28,7 +28,7 @@ def sample_end(label: Label) -> int:
 
 
 def encode_samples(
-    encoder: Encoder, samples: Iterable[Sample], *, threads: int | None = None
+    encoder: FeatureMap, samples: Iterable[Sample], *, threads: int | None = None
 ) -> Iterator[tuple[Label, NDArray[np.float32]]]:
     """Encode labelled samples on several threads; kernels release the GIL.
 

@@ -1,19 +1,22 @@
 """The machine that figures were measured on.
 
-Lives here: its description, and how far others disturbed what was measured.
+Lives here: its description, how far others disturbed what was measured, and how much memory it took.
 Not here: measuring anything of streamfeat.
 """
 
+import contextlib
 import os
 import platform
 import resource
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
-__all__ = ["Disturbance", "describe_machine"]
+__all__ = ["Disturbance", "PeakMemory", "describe_machine"]
 
 _CPUINFO, _STAT = Path("/proc/cpuinfo"), Path("/proc/stat")
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _STEAL = 7
 """Column of /proc/stat: time that the hypervisor gave to another machine."""
 _GUEST = 8
@@ -50,6 +53,34 @@ class Disturbance:
             return None
         total = sum(now) - sum(self._start)
         return (now[_STEAL] - self._start[_STEAL]) / total if total > 0 else 0.0
+
+
+class PeakMemory:
+    """The most memory this process held while the block ran, in `peak_mb` afterwards.
+
+    Where the system cannot forget an earlier peak (it is Linux that can), it is that of the whole process.
+    """
+
+    peak_mb: int
+
+    def __enter__(self) -> Self:
+        """Forget the peak so far."""
+        with contextlib.suppress(OSError):
+            _CLEAR.write_text("5")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Read the peak."""
+        if _STATUS.exists():
+            lines = _STATUS.read_text().splitlines()
+            kilobytes = [int(line.split()[1]) for line in lines if line.startswith("VmHWM")]
+        else:
+            # In bytes on macOS, in kilobytes elsewhere.
+            unit = 1024 if platform.system() == "Darwin" else 1
+            kilobytes = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit]
+        self.peak_mb = round(kilobytes[0] * 1024 / 1e6)
 
 
 def _cpu_model() -> str:

@@ -14,7 +14,7 @@ from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random
 from streamfeat.engine import Engine
 from streamfeat.events import EVENT_DTYPE
 from streamfeat.geometry import Geometry
-from streamfeat.kernels import code, decode, encode, follow, ingest, lasso, planes, update, volume
+from streamfeat.kernels import code, decode, encode, follow, ingest, lasso, planes, surfaces, update, volume
 from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
@@ -821,6 +821,33 @@ def make_lower_half(rng):
     return (tuple(int(side) for side in rng.integers(1, 9, 2)),)
 
 
+def _surface_events(rng, height, width, n):
+    t = np.sort(rng.uniform(0, 3, n))
+    x, y = rng.integers(0, width, n), rng.integers(0, height, n)
+    return x, y, rng.integers(0, 2, n), t
+
+
+def make_add_memory_surfaces(rng):
+    height, width, cell, radius = rng.integers(3, 12, 4) // [1, 1, 1, 3]
+    rows, columns, side = -(-height // cell), -(-width // cell), 2 * radius + 1
+    events = _surface_events(rng, height, width, int(rng.integers(0, 60)))
+    memory = rng.uniform(0, 2, (2, height, width))
+    return *events, int(cell), memory, rng.uniform(0, 1, (rows, columns, 2, side, side))
+
+
+def make_time_surfaces(rng):
+    height, width, side = int(rng.integers(1, 9)), int(rng.integers(1, 9)), 2 * int(rng.integers(0, 4)) + 1
+    events = _surface_events(rng, height, width, int(rng.integers(0, 60)))
+    latest = np.full((2, height + side - 1, width + side - 1), -np.inf)
+    return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
+
+
+def close_surfaces(kernel: Run, twin: Run) -> None:
+    """Powers of e may differ in their last bits."""
+    for mine, yours in zip(kernel.after, twin.after, strict=True):
+        np.testing.assert_allclose(mine, yours, rtol=1e-6)
+
+
 @dataclass(frozen=True)
 class Row:
     """A kernel, a maker of random arguments, and the meaning of "the same result"."""
@@ -888,6 +915,8 @@ KERNELS = [
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
     Row(follow.trace, make_trace, exact_but_features),
+    Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),
+    Row(surfaces.time_surfaces, make_time_surfaces, close_surfaces),
     Row(volume.add_column, make_add_column),
     Row(volume.change_moments, make_change_moments),
     Row(volume.add_columns, make_add_columns),

@@ -692,3 +692,34 @@ def features_from(codes, encoding):
     rows, columns = ((side + 1) // 2 for side in codes.shape[:2])
     quadrants = codes[:rows, :columns], codes[:rows, columns:], codes[rows:, :columns], codes[rows:, columns:]
     return np.concatenate([q.sum(axis=(0, 1)) for q in quadrants])
+
+
+# streamfeat.kernels.surfaces
+
+
+def add_memory_surfaces(x, y, p, t, cell, memory, sums):
+    radius = sums.shape[3] // 2
+    events = list(zip(x.tolist(), y.tolist(), p.tolist(), t.tolist(), strict=True))
+    before = memory.copy()
+    for i, (xi, yi, pi, ti) in enumerate(events):
+        row, column = yi // cell, xi // cell
+        for dy in range(-radius, radius + 1):
+            for dx in range(-radius, radius + 1):
+                there = yi + dy, xi + dx
+                if (there[0] // cell, there[1] // cell) != (row, column):
+                    continue
+                if not (0 <= there[0] < memory.shape[1] and 0 <= there[1] < memory.shape[2]):
+                    continue
+                past = sum(math.exp(tj - ti) for xj, yj, pj, tj in events[:i] if (yj, xj, pj) == (*there, pi))
+                past += math.exp(-ti) * before[(pi, *there)]
+                sums[row, column, pi, dy + radius, dx + radius] += past
+    for xi, yi, pi, ti in events:
+        memory[pi, yi, xi] += math.exp(ti)
+
+
+def time_surfaces(x, y, p, t, latest, out):
+    radius = out.shape[2] // 2
+    for i in range(len(t)):
+        latest[p[i], y[i] + radius, x[i] + radius] = t[i]
+        around = latest[:, y[i] : y[i] + 2 * radius + 1, x[i] : x[i] + 2 * radius + 1]
+        out[i] = np.exp(around - t[i])

@@ -1,0 +1,244 @@
+"""The result of an evaluation as one page.
+
+Lives here: which tables and figures it has, in which order, and the figures.
+Not here: the skeleton of a page (`streamfeat.report`), numbers as text (`words`).
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.errors import InputError
+from streamfeat.evaluate.words import (
+    COLUMNS,
+    base_rows,
+    cells,
+    early_table,
+    notes,
+    online_table,
+    sweep_tables,
+)
+from streamfeat.report import Section, Table, require, write_report
+
+if TYPE_CHECKING:
+    from bokeh.plotting import figure
+
+__all__ = ["check_page", "tiled", "write_page"]
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
+_TILE_COLUMNS = 8
+
+Parts = list["str | Table | figure"]
+
+
+def check_page(path: Path) -> None:
+    """Check that a page of this name can be written.
+
+    Raises:
+        InputError: its ending is not .html, or the extra `plot` is missing.
+    """
+    if path.suffix != ".html":
+        raise InputError(f"{path}: --report writes a page; give a name that ends in .html")
+    require("bokeh")
+
+
+def write_page(path: Path, result: dict[str, Any]) -> None:
+    """Write the page; it appears whole or not at all, and replaces an earlier one.
+
+    Raises:
+        InputError: see `check_page`; or the folder cannot be written to.
+    """
+    check_page(path)
+    rows = base_rows(result)
+    machine = ", ".join(f"{name} {value}" for name, value in result["machine"].items())
+    numeric = [name not in ("method", "geometry") for name in COLUMNS]
+    table = Table(COLUMNS, [cells(row) for row in rows], numeric)
+    sections = [Section("Accuracy", [table, *notes(result), f"Measured on: {machine}."])]
+    if sweeps := list(_sweeps(result)):
+        sections.append(Section("Sweeps", sweeps))
+    if early := [row for row in rows if "early" in row]:
+        sections.append(Section("Early decision", _early(result, early)))
+    if online := [row for row in rows if "prequential" in row]:
+        sections.append(Section("Online: predicting before learning", _online(result, online)))
+    confusions: Parts = [_confusion(row, result["labels"]) for row in rows]
+    sections.append(Section("Confusion", confusions))
+    learned = [row for row in rows if "learned" in row]
+    if history := [row for row in learned if "objective" in row["learned"]]:
+        sections.append(Section("Convergence", list(_convergence(history))))
+    if learned:
+        sections.append(Section("Filters", list(_filters(learned))))
+    write_report(path, f"streamfeat evaluate: {', '.join(result['recordings'])}", sections)
+
+
+def _plot(x: str, y: str, *, height: int = 340, **options: Any) -> "figure":
+    from bokeh.plotting import figure
+
+    plot = figure(width=1060, height=height, x_axis_label=x, y_axis_label=y, tools=_TOOLS, **options)
+    for axis in plot.axis:
+        axis.axis_label_text_font_size = "13px"
+        axis.major_label_text_font_size = "12px"
+    return plot
+
+
+def _with_legend(plot: "figure") -> "figure":
+    plot.add_layout(plot.legend[0], "right")
+    plot.legend.click_policy = "hide"
+    plot.legend.label_text_font_size = "12px"
+    return plot
+
+
+def _line(plot: "figure", xs: Sequence[float], ys: Sequence[float], name: str, i: int, **style: Any) -> None:
+    colour = _COLOURS[i % len(_COLOURS)]
+    plot.line(xs, ys, color=colour, line_width=2, legend_label=name, **style)
+    plot.scatter(xs, ys, color=colour, size=5, legend_label=name)
+
+
+def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
+    for name, (header, lines) in sweep_tables(result):
+        title = "number of filters K" if name == "filters" else name.replace("_", " ")
+        yield Table(header, lines, [True] * len(header))
+        plot = _plot({"patch": "patch, pixels"}.get(name, title), "accuracy")
+        rows = [row for row in result["rows"] if row["swept"] == name]
+        methods = list(dict.fromkeys(row["method"] for row in rows))
+        for i, method in enumerate(methods):
+            points = sorted(
+                (row["setting"][name], row["accuracy"], row["low"], row["high"])
+                for row in rows
+                if row["method"] == method
+            )
+            values, accuracies, lows, highs = zip(*points, strict=True)
+            _line(plot, values, accuracies, method, i)
+            plot.segment(values, lows, values, highs, color=_COLOURS[i % len(_COLOURS)], legend_label=method)
+        paper = result["published"]["sweeps"].get(name, {})
+        for i, method in enumerate(("direct", "inverse") if paper else ()):
+            label = f"paper's {method}, {result['published']['data']}"
+            published = [figures[method] for figures in paper.values()]
+            _line(plot, list(map(int, paper)), published, label, len(methods) + i, line_dash="dashed")
+        yield _with_legend(plot)
+
+
+def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
+    header, lines = early_table(result)
+    by_time = _plot("time since the sample began, ms", "accuracy")
+    by_events = _plot("events since the sample began", "accuracy", x_axis_type="log")
+    for i, row in enumerate(rows):
+        for plot, axis, unit in ((by_time, "time", "ms"), (by_events, "events", "events")):
+            points = row["early"][axis]
+            _line(plot, [p[unit] for p in points], [p["accuracy"] for p in points], row["method"], i)
+    return [Table(header, lines, [False, True, True, True]), _with_legend(by_time), _with_legend(by_events)]
+
+
+def _online(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
+    header, lines = online_table(result)
+    plot = _plot("samples seen", "accuracy so far", x_axis_type="log", y_range=(0, 1))
+    for i, row in enumerate(rows):
+        for order, dash in (("stream", "solid"), ("shuffled", "dotted")):
+            curve = row["prequential"][order]["curve"]
+            name = f"{row['method']}, {'stream order' if order == 'stream' else order}"
+            xs, ys = [p["samples"] for p in curve], [p["accuracy"] for p in curve]
+            _line(plot, xs, ys, name, i, line_dash=dash)
+    return [Table(header, lines, [False, True, True]), _with_legend(plot)]
+
+
+def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
+    from bokeh.transform import linear_cmap
+
+    counts = np.array(row["confusion"])
+    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    true, predicted = (index.ravel().tolist() for index in np.indices(counts.shape))
+    data = {
+        "true": [names[i] for i in true],
+        "predicted": [names[i] for i in predicted],
+        "share": shares.ravel(),
+        "count": [f"{count:,}" if count else "" for count in counts.ravel()],
+        "ink": ["white" if share > 0.5 else "#222" for share in shares.ravel()],
+    }
+    plot = _plot(
+        "predicted label",
+        "true label",
+        height=max(260, 120 + 26 * len(names)),
+        x_range=list(names),
+        y_range=list(reversed(names)),
+        title=f"{row['method']}: samples; colour is the share of the true label",
+    )
+    fill = linear_cmap("share", [f"#{g:02x}{g:02x}ff" for g in range(255, 60, -2)], 0, 1)
+    plot.rect("predicted", "true", 1, 1, source=data, fill_color=fill, line_color="#ddd")
+    if len(names) <= 30:
+        plot.text(
+            "predicted",
+            "true",
+            text="count",
+            source=data,
+            text_color="ink",
+            text_align="center",
+            text_baseline="middle",
+            text_font_size="12px",
+        )
+    else:
+        plot.xaxis.major_label_orientation = "vertical"
+    return plot
+
+
+def _convergence(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]:
+    yield "The objective after each half-step: codes, then filters. It may not rise."
+    for i, row in enumerate(rows):
+        objective = row["learned"]["objective"]
+        plot = _plot("iteration", "objective, mean over volumes", height=280)
+        _line(plot, (np.arange(len(objective)) / 2 + 0.5).tolist(), objective, row["method"], i)
+        yield _with_legend(plot)
+    for name, label in (
+        ("condition", "condition number (ratio of singular values)"),
+        ("coherence", "coherence (largest |cos| between filters)"),
+    ):
+        plot = _plot("iteration", label, height=280)
+        for i, row in enumerate(rows):
+            values = [np.nan if value is None else value for value in row["learned"][name]]
+            _line(plot, list(range(1, len(values) + 1)), values, row["method"], i)
+        yield _with_legend(plot)
+
+
+def _filters(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]:
+    from bokeh.palettes import Greys256
+
+    yield (
+        "Filters in the whitened domain (rows of A, columns of D), evenly chosen from all. Each tile shows "
+        "the time bins of one filter side by side, oldest first; grey is zero, and each filter has its "
+        "own contrast."
+    )
+    for row in rows:
+        shown = row["learned"]["filters"]
+        image = tiled(np.array(shown), row["learned"]["shape"])
+        height, width = image.shape
+        plot = _plot(
+            "column, pixels; bins side by side",
+            "row, pixels",
+            height=int(80 + 980 * height / width),
+            x_range=(0, width),
+            y_range=(height, 0),
+            title=f"{row['method']}: {len(shown)} of {row['setting']['filters']:,} filters",
+        )
+        # Rows of an image are drawn upwards; the axis runs downwards.
+        plot.image(image=[image], x=0, y=0, dw=width, dh=height, palette=Greys256)
+        plot.grid.visible = False
+        yield plot
+
+
+def tiled(filters: NDArray[np.float64], shape: Sequence[int]) -> NDArray[np.uint8]:
+    """One picture of `(n, d)` filters of `shape` (bins, rows, columns): 128 is zero, gaps are white."""
+    bins, rows, columns = shape
+    scale = np.maximum(np.abs(filters).max(axis=1, keepdims=True), 1e-12)
+    grey = np.round(128 + 127 * filters / scale).astype(np.uint8)
+    tiles = grey.reshape(-1, bins, rows, columns).transpose(0, 2, 1, 3)
+    lines = -(-len(tiles) // _TILE_COLUMNS)
+    step = rows + 2, bins * (columns + 1) + 2
+    picture = np.full((lines * step[0], _TILE_COLUMNS * step[1]), 255, np.uint8)
+    for i, tile in enumerate(tiles):
+        top, left = i // _TILE_COLUMNS * step[0], i % _TILE_COLUMNS * step[1]
+        for b in range(bins):
+            at = left + b * (columns + 1)
+            picture[top : top + rows, at : at + columns] = tile[:, b]
+    return picture

@@ -1,0 +1,212 @@
+"""All cells, each kept as soon as it is done, and the result that they add up to.
+
+Lives here: the loop, the state file that an interrupted run goes on from, sums over folds.
+Not here: what a cell does (`cell`), the result as text or page (`words`, `page`).
+"""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from streamfeat.errors import InputError
+from streamfeat.evaluate.cell import run_cell
+from streamfeat.evaluate.methods import Report
+from streamfeat.evaluate.plan import FILTER_METHODS, Cell
+from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
+from streamfeat.evaluate.scores import SHARE, bootstrap_interval, fold_interval, time_to_share
+from streamfeat.evaluate.splits import DataSet
+from streamfeat.files import write_atomically
+from streamfeat.machine import describe_machine
+
+__all__ = ["StateFile", "evaluate", "save_result", "state_path"]
+
+_VERSION = 1
+
+
+def state_path(output: Path) -> Path:
+    """Where the state of a run is kept whose result goes to `output`."""
+    return output.with_name(output.name + ".part")
+
+
+class StateFile:
+    """Finished cells as JSON lines; the first line says of what. Appended to, so a crash costs one line.
+
+    Args:
+        path: the file; None keeps nothing.
+        header: what has to be the same for cells to be used again (JSON values).
+
+    Raises:
+        InputError: the file is of another run, or cannot be written.
+    """
+
+    def __init__(self, path: Path | None, header: dict[str, Any]) -> None:
+        """Read what is there, or begin."""
+        self._path = path
+        self._done: dict[str, dict[str, Any]] = {}
+        if path is None:
+            return
+        try:
+            lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        # A line without its end was being written when the run was cut off.
+        whole = [line for line in lines if line.endswith(b"\n")]
+        records = [_parsed(path, i, line) for i, line in enumerate(whole)]
+        if records and records[0] != header:
+            raise InputError(
+                f"{path}: is of a run with other recordings, folds or version; give the same arguments, "
+                "or delete it to start anew"
+            )
+        for record in records[1:]:
+            self._done[_name(record["cell"])] = record["result"]
+        if not records or len(whole) < len(lines):
+            write_atomically(path, b"".join(whole) or _line(header))
+
+    def __len__(self) -> int:
+        """How many cells are done."""
+        return len(self._done)
+
+    def get(self, cell: Cell) -> dict[str, Any] | None:
+        """The result of a cell if it is done."""
+        return self._done.get(_name(cell.key))
+
+    def add(self, cell: Cell, result: dict[str, Any]) -> None:
+        """Keep a result; it is on disk when this returns."""
+        self._done[_name(cell.key)] = result
+        if self._path is not None:
+            with self._path.open("ab") as file:
+                file.write(_line({"cell": cell.key, "result": result}))
+                file.flush()
+                os.fsync(file.fileno())
+
+
+def _name(key: dict[str, Any]) -> str:
+    return json.dumps(key, sort_keys=True)
+
+
+def _line(record: dict[str, Any]) -> bytes:
+    return json.dumps(record).encode() + b"\n"
+
+
+def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
+    try:
+        record = json.loads(line)
+        if number and not (record["cell"] and record["result"].keys() >= {"right", "samples", "confusion"}):
+            raise ValueError("it is not a finished cell")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: line {number + 1} cannot be read ({error}); delete the file") from error
+    return dict(record)
+
+
+def evaluate(
+    data: DataSet,
+    cells: Sequence[Cell],
+    *,
+    early_samples: int = 500,
+    state: Path | None = None,
+    report: Report = lambda step, done, total, remark: None,
+    finished: Callable[[dict[str, Any]], None] = lambda row: None,
+) -> dict[str, Any]:
+    """Run all cells that are not done, and add up the result (JSON values).
+
+    Args:
+        data: labelled recordings.
+        cells: from `plan.plan_cells`.
+        early_samples: held-out samples for early decision.
+        state: file of finished cells, read and written.
+        report: told about progress.
+        finished: called with each row of the result when its last fold is done.
+
+    Raises:
+        InputError: see `run_cell` and `StateFile`.
+        KeyboardInterrupt: Ctrl-C; what is finished is in `state`.
+    """
+    header = {
+        "format": "streamfeat-evaluate",
+        "version": _VERSION,
+        "recordings": [[str(path.name), path.stat().st_size] for path in data.paths],
+        "folds": data.n_folds,
+        "early_samples": early_samples,
+    }
+    kept = StateFile(state, header)
+    rows: list[dict[str, Any]] = []
+    for i, cell in enumerate(cells):
+        report("cells", i, len(cells), cell.method + (f", {_swept(cell)}" if cell.swept else ""))
+        if (result := kept.get(cell)) is None:
+            result = run_cell(data, cell, report, early_samples=early_samples)
+            kept.add(cell, result)
+        if cell.fold == data.n_folds - 1:
+            rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)]))
+            finished(rows[-1])
+    report("cells", len(cells), len(cells), "")
+    return {
+        "recordings": [path.name for path in data.paths],
+        "labels": data.names,
+        "samples": {"training": rows[0]["samples"][0], "held_out": rows[0]["samples"][1]},
+        "split": "the recording's held-out split" if data.held_out_split else f"{data.n_folds} folds",
+        "interval": (
+            "95 % bootstrap interval over held-out samples"
+            if data.held_out_split
+            else f"95 % interval of the mean over {data.n_folds} stratified folds (Student's t)"
+        ),
+        "rows": rows,
+        "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
+        "machine": describe_machine(),
+    }
+
+
+def save_result(path: Path, result: dict[str, Any]) -> None:
+    """Write a result as JSON, whole or not at all; the state that it came from is not needed any more."""
+    write_atomically(path, json.dumps(result, indent=1).encode() + b"\n")
+    state_path(path).unlink(missing_ok=True)
+
+
+def _swept(cell: Cell) -> str:
+    return f"{cell.swept} {asdict(cell.setting)[cell.swept]}"
+
+
+def _folds_of(cell: Cell, cells: Sequence[Cell]) -> list[Cell]:
+    same = (cell.method, cell.setting, cell.swept)
+    return [other for other in cells if (other.method, other.setting, other.swept) == same]
+
+
+def _row(cell: Cell, folds: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row of the result from the folds of one method and setting."""
+    right = [fold["right"] for fold in folds]
+    scored = [fold["samples"][1] for fold in folds]
+    accuracies = [r / n for r, n in zip(right, scored, strict=True)]
+    low, high = fold_interval(accuracies) if len(folds) > 1 else bootstrap_interval(right[0], scored[0])
+    row: dict[str, Any] = {
+        "method": cell.method,
+        "swept": cell.swept,
+        "setting": asdict(cell.setting) if cell.method in FILTER_METHODS else {},
+        "accuracy": round(float(np.mean(accuracies)), 4),
+        "low": round(max(low, 0.0), 4),
+        "high": round(min(high, 1.0), 4),
+        "folds": [round(a, 4) for a in accuracies],
+        "samples": folds[0]["samples"],
+        "features": folds[0]["features"],
+        "C": [fold["C"] for fold in folds],
+        **{
+            name: round(float(np.mean([fold[name] for fold in folds])), 3)
+            for name in ("learn_s", "encode_s", "train_s")
+        },
+        "peak_mb": max(fold["peak_mb"] for fold in folds),
+        "confusion": np.sum([fold["confusion"] for fold in folds], axis=0).tolist(),
+    }
+    for name in ("prequential", "early", "learned"):
+        if name in folds[0] and not cell.swept:
+            row[name] = folds[0][name]
+    if "early" in row:
+        early = row["early"]
+        row["share_reached"] = {
+            "share": SHARE,
+            "ms": time_to_share(early["time"], "ms"),
+            "events": time_to_share(early["events"], "events"),
+        }
+    return row

@@ -1,0 +1,173 @@
+"""Scores: accuracy with its interval, confusion, early decision, prequential accuracy.
+
+Lives here: what is computed from features and labels. Not here: where features come from.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from streamfeat.classifier import Classifier, OnlineClassifier
+from streamfeat.encoder import FeatureMap
+from streamfeat.features import encode_samples
+from streamfeat.recording import Sample
+
+__all__ = [
+    "bootstrap_interval",
+    "confusion",
+    "early_decision",
+    "fold_interval",
+    "predict_all",
+    "prequential",
+    "time_to_share",
+]
+
+SHARE = 0.9
+"""Of the final accuracy: when it is reached, a decision counts as early."""
+
+_RESAMPLES = 10_000
+_TIMES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+_FIRST_EVENTS = 50
+
+
+def bootstrap_interval(right: int, n: int, seed: int = 0) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of an accuracy, over test samples (Efron 1979).
+
+    Drawing `n` of `n` samples again with replacement makes the number of right ones binomial.
+    """
+    drawn = np.random.default_rng(seed).binomial(n, right / n, _RESAMPLES) / n
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def fold_interval(accuracies: Sequence[float]) -> tuple[float, float]:
+    """95 % interval of the mean over folds, by Student's t.
+
+    Folds share training samples, so it is a little narrow.
+    """
+    n, mean = len(accuracies), float(np.mean(accuracies))
+    half = float(student.ppf(0.975, n - 1) * np.std(accuracies, ddof=1) / np.sqrt(n))
+    return mean - half, mean + half
+
+
+def confusion(true: Sequence[str], predicted: Sequence[str], names: Sequence[str]) -> list[list[int]]:
+    """How many samples of each class (row) were taken for each class (column), in the order of `names`."""
+    place = {name: i for i, name in enumerate(names)}
+    matrix = np.zeros((len(names), len(names)), int)
+    np.add.at(matrix, ([place[name] for name in true], [place[name] for name in predicted]), 1)
+    return [[int(count) for count in row] for row in matrix]
+
+
+def predict_all(classifier: Classifier, features: NDArray[np.float32]) -> list[str]:
+    """The label with the highest score for each row of `(n, F)` features."""
+    return [classifier.labels[i] for i in classifier.scores(features).argmax(axis=-1)]
+
+
+def early_decision(
+    features: FeatureMap, classifier: Classifier, samples: Sequence[Sample]
+) -> dict[str, list[dict[str, float]]]:
+    """Accuracy when a sample has been seen for some time only, or some of its events.
+
+    The window ends where the decision is made, as that of a running engine does, while the classifier was
+    trained on whole samples. A sample that has ended by then counts with all that it has.
+
+    Args:
+        features: of windows.
+        classifier: trained on whole samples.
+        samples: held-out samples, in memory.
+
+    Returns:
+        `time`: points `{"ms", "accuracy"}`; `events`: points `{"events", "accuracy"}`. The last is the whole.
+    """
+    ordered = [
+        replace(sample, events=sample.events[np.argsort(sample.events["t"], kind="stable")])
+        for sample in samples
+    ]
+    longest = max(sample.label.duration_us for sample in ordered)
+    most = max(len(sample.events) for sample in ordered)
+    counts = [_FIRST_EVENTS]
+    while counts[-1] < most:
+        counts.append(2 * counts[-1])
+
+    def accuracy(cut: list[Sample]) -> float:
+        right = 0
+        for label, row in encode_samples(features, cut):
+            right += classifier.predict(row) == label.label
+        return right / len(cut)
+
+    times = [round(share * longest) for share in _TIMES]
+    return {
+        "time": [
+            {"ms": t / 1000, "accuracy": accuracy([_first_us(sample, t) for sample in ordered])}
+            for t in times
+        ],
+        "events": [
+            {
+                "events": min(count, most),
+                "accuracy": accuracy([_first_events(sample, count) for sample in ordered]),
+            }
+            for count in counts
+        ],
+    }
+
+
+def _first_us(sample: Sample, t_us: int) -> Sample:
+    label = replace(sample.label, duration_us=max(1, min(sample.label.duration_us, t_us)))
+    return Sample(label, sample.events[: _before(sample, label.duration_us)], sample.resolution)
+
+
+def _first_events(sample: Sample, count: int) -> Sample:
+    if count >= len(sample.events):
+        return sample
+    last = int(sample.events["t"][count - 1])
+    label = replace(sample.label, duration_us=last + 1 - sample.label.start_us)
+    return Sample(label, sample.events[:count], sample.resolution)
+
+
+def _before(sample: Sample, t_us: int) -> int:
+    return int(np.searchsorted(sample.events["t"], sample.label.start_us + t_us))
+
+
+def time_to_share(points: Sequence[dict[str, float]], axis: str, share: float = SHARE) -> float:
+    """The first measured point from which on accuracy is at least a share of the final one."""
+    goal = share * points[-1]["accuracy"]
+    reached = points[-1][axis]
+    for point in reversed(points):
+        if point["accuracy"] < goal:
+            break
+        reached = point[axis]
+    return reached
+
+
+def prequential(features: FeatureMap, rows: NDArray[np.float32], labels: Sequence[str]) -> dict[str, Any]:
+    """Accuracy of a classifier that starts from nothing and predicts each sample before it learns it.
+
+    The plain loop: `right += predict_one(x) == y; learn_one(x, y)` (Dawid 1984; Gama et al. 2013).
+
+    Args:
+        features: what made the rows.
+        rows: `(n, F)` float32 in the order of the stream; not changed.
+        labels: `n` names.
+
+    Returns:
+        `accuracy`; `curve`, the accuracy so far at some points; `label_changes` between neighbours, few
+        of which make the task easy: guessing the label before would be right elsewhere.
+    """
+    online = OnlineClassifier(Classifier.untrained(labels, features))
+    hits = np.zeros(len(labels), bool)
+    for i, (row, label) in enumerate(zip(rows, labels, strict=True)):
+        hits[i] = online.predict_one(row) == label
+        online.learn_one(row, label)
+    points = np.unique(np.geomspace(1, len(hits), 40).astype(int))
+    so_far = np.cumsum(hits)[points - 1] / points
+    return {
+        "accuracy": round(float(hits.mean()), 4),
+        "label_changes": int(np.sum(np.asarray(labels)[1:] != np.asarray(labels)[:-1])),
+        "curve": [
+            {"samples": int(n), "accuracy": round(float(a), 4)} for n, a in zip(points, so_far, strict=True)
+        ],
+    }

@@ -1,0 +1,218 @@
+"""What our features are compared with: count images, HATS, HOTS.
+
+Lives here: each of them as a map from the events of a sample to a feature vector, as an encoder is one.
+Not here: features made by filters (`methods`), and the loops over events (`kernels.surfaces`).
+"""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.cluster import MiniBatchKMeans
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
+from streamfeat.recording import HELD_OUT_SPLITS, Recording, Sample
+
+__all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
+
+_FITTED_SAMPLES = 1_000
+"""Training samples whose surfaces prototypes are learned from: enough for so few prototypes."""
+
+
+@dataclass(frozen=True, slots=True)
+class CountImage:
+    """Events of each polarity, counted on a grid as large as the sample: what a camera's picture would be.
+
+    Attributes:
+        grid: rows and columns of the grid.
+    """
+
+    grid: int = 16
+
+    @property
+    def n_features(self) -> int:
+        """Both polarities of every place."""
+        return 2 * self.grid**2
+
+    @property
+    def fingerprint(self) -> str:
+        """Everything that decides what features are."""
+        return repr(self)
+
+    def encode(
+        self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
+    ) -> NDArray[np.float32]:
+        """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        x, y, p, _ = _until(events, resolution, origin_us, t_us)
+        places = (p * self.grid + y * self.grid // resolution[0]) * self.grid + x * self.grid // resolution[1]
+        return np.bincount(places, minlength=self.n_features).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class AveragedSurfaces:
+    """HATS: histograms of averaged time surfaces (Sironi et al. 2018, "HATS", CVPR, section 4).
+
+    Parameters are the paper's for N-CARS: cells of 10 pixels, surfaces of 7, `tau` of 10^9 us. Deviations:
+    the memory reaches back to the start of the sample (their `Delta t` is 100 ms, the length of an N-CARS
+    sample), an event at the same microsecond belongs to the past if it is stored earlier, and in place of
+    their normalisation every method's features have ours.
+
+    Attributes:
+        resolution: largest `(height, width)` of a training sample; what lies beyond is ignored.
+        cell: rows and columns of a cell, in pixels.
+        radius: of a surface, in pixels.
+        tau_us: time in which the past fades to 1/e.
+    """
+
+    resolution: Resolution
+    cell: int = 10
+    radius: int = 3
+    tau_us: float = 1e9
+
+    @classmethod
+    def fitted(cls, recordings: Sequence[Recording]) -> "AveragedSurfaces":
+        """Cells over the largest training sample."""
+        height, width = np.max([s.resolution for s in _training(recordings)], axis=0).tolist()
+        return cls((height, width))
+
+    @property
+    def n_features(self) -> int:
+        """Both polarities of a surface for each cell."""
+        return int(np.prod(self._shape))
+
+    @property
+    def fingerprint(self) -> str:
+        """Everything that decides what features are."""
+        return repr(self)
+
+    @property
+    def _shape(self) -> tuple[int, int, int, int, int]:
+        rows, columns = (-(-side // self.cell) for side in self.resolution)
+        return rows, columns, 2, 2 * self.radius + 1, 2 * self.radius + 1
+
+    def encode(
+        self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
+    ) -> NDArray[np.float32]:
+        """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        inside = min(resolution[0], self.resolution[0]), min(resolution[1], self.resolution[1])
+        x, y, p, t = _until(events, inside, origin_us, t_us)
+        sums = np.zeros(self._shape)
+        add_memory_surfaces(x, y, p, t / self.tau_us, self.cell, np.zeros((2, *self.resolution)), sums)
+        rows, columns = self._shape[:2]
+        cells = np.bincount(y // self.cell * columns + x // self.cell, minlength=rows * columns)
+        sums /= np.maximum(cells, 1).reshape(rows, columns, 1, 1, 1)
+        return sums.ravel().astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceHistogram:
+    """A single layer of HOTS: how often each prototype of time surfaces occurs (Lagorce et al. 2017, TPAMI).
+
+    Deviations: one layer in place of three, with more prototypes; prototypes by k-means in place of their
+    online clustering; a histogram for each quadrant, as our codes are pooled, in place of one.
+
+    Attributes:
+        prototypes: `(n, 2 (2 R + 1)^2)` float32.
+        radius: of a surface, in pixels.
+        tau_us: time in which a surface fades to 1/e.
+    """
+
+    prototypes: NDArray[np.float32]
+    radius: int = 3
+    tau_us: float = 20_000.0
+
+    @classmethod
+    def fitted(
+        cls, recordings: Sequence[Recording], n_prototypes: int = 64, n_surfaces: int = 50_000, seed: int = 0
+    ) -> "SurfaceHistogram":
+        """Prototypes of the surfaces at random events of random training samples.
+
+        Raises:
+            InputError: there is no event.
+        """
+        rng = np.random.default_rng(seed)
+        n_samples = sum(
+            label.split not in HELD_OUT_SPLITS for recording in recordings for label in recording.labels
+        )
+        chosen = set(rng.permutation(n_samples)[:_FITTED_SAMPLES].tolist())
+        each = -(-n_surfaces // max(len(chosen), 1))
+        blank = cls(np.zeros((0, 0), np.float32))
+        drawn = []
+        for i, sample in enumerate(_training(recordings)):
+            if i not in chosen:
+                continue
+            surfaces = blank._surfaces(*_until(sample.events, sample.resolution), sample.resolution)
+            if len(surfaces):
+                drawn.append(surfaces[rng.integers(0, len(surfaces), each)])
+        if not drawn:
+            raise InputError("the training samples have no events; hots has nothing to learn from")
+        means = MiniBatchKMeans(n_prototypes, batch_size=4096, n_init=1, random_state=seed)
+        with threadpool_limits(1, user_api="openmp"):
+            means.fit(np.concatenate(drawn))
+        return cls(means.cluster_centers_.astype(np.float32))
+
+    @property
+    def n_features(self) -> int:
+        """Each prototype in four quadrants."""
+        return 4 * len(self.prototypes)
+
+    @property
+    def fingerprint(self) -> str:
+        """Everything that decides what features are."""
+        return hashlib.sha256(
+            repr((self.radius, self.tau_us)).encode() + self.prototypes.tobytes()
+        ).hexdigest()
+
+    def encode(
+        self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
+    ) -> NDArray[np.float32]:
+        """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        x, y, p, t = _until(events, resolution, origin_us, t_us)
+        surfaces = self._surfaces(x, y, p, t, resolution)
+        # |s - c|^2 is least where c.s - |c|^2 / 2 is largest.
+        likeness = surfaces @ self.prototypes.T - np.square(self.prototypes).sum(axis=1) / 2
+        quadrant = 2 * (2 * y >= resolution[0]) + (2 * x >= resolution[1])
+        places = quadrant * len(self.prototypes) + likeness.argmax(axis=1)
+        return np.bincount(places, minlength=self.n_features).astype(np.float32)
+
+    def _surfaces(
+        self,
+        x: NDArray[np.int64],
+        y: NDArray[np.int64],
+        p: NDArray[np.int64],
+        t: NDArray[np.int64],
+        resolution: Resolution,
+    ) -> NDArray[np.float32]:
+        """`(n, 2 (2 R + 1)^2)`."""
+        side = 2 * self.radius + 1
+        latest = np.full((2, resolution[0] + side - 1, resolution[1] + side - 1), -np.inf)
+        out = np.empty((len(t), 2, side, side), np.float32)
+        time_surfaces(x, y, p, t / self.tau_us, latest, out)
+        return out.reshape(len(t), 2 * side * side)
+
+
+def _training(recordings: Sequence[Recording]) -> Iterator[Sample]:
+    """Samples of splits that are not held out."""
+    for recording in recordings:
+        for sample in recording.samples():
+            if sample.label.split not in HELD_OUT_SPLITS:
+                yield sample
+
+
+def _until(
+    events: Events, resolution: Resolution, origin_us: int | None = None, t_us: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """`x, y, p` and the time since the origin, in order of time, of the events that count."""
+    x, y, p, t = (events[name].astype(np.int64) for name in ("x", "y", "p", "t"))
+    if len(t) == 0:
+        return x, y, p, t
+    origin = int(t.min()) if origin_us is None else origin_us
+    last = int(t.max()) if t_us is None else t_us
+    keep = (x < resolution[1]) & (y < resolution[0]) & ((p == 0) | (p == 1)) & (t >= origin) & (t <= last)
+    order = np.flatnonzero(keep)[np.argsort(t[keep], kind="stable")]
+    return x[order], y[order], p[order], t[order] - origin

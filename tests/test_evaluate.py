@@ -1,0 +1,505 @@
+"""Evaluation: splits, baselines, scores, runs that go on after an interruption, and how all is shown."""
+
+import itertools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import tiny
+from scipy.stats import t as student
+from typer.testing import CliRunner
+
+from streamfeat import cli
+from streamfeat.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.errors import InputError
+from streamfeat.evaluate import published, scores
+from streamfeat.evaluate.methods import random_filters, spherical_means
+from streamfeat.evaluate.page import tiled
+from streamfeat.evaluate.plan import METHODS, Cell, Setting, parse_sweep, plan_cells
+from streamfeat.evaluate.run import StateFile, state_path
+from streamfeat.evaluate.splits import DataSet
+from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
+from streamfeat.events import make_events
+from streamfeat.learn.chunks import LazyVolumes
+from streamfeat.machine import PeakMemory
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Sample, open_recording
+
+QUICK = ["--patch", "4", "--bins", "2", "--filters", "12", "--volumes", "600", "--iterations", "2"]
+BASELINES = [
+    CountImage(4),
+    AveragedSurfaces((12, 16), cell=5, radius=2),
+    SurfaceHistogram(np.random.default_rng(0).random((6, 50), np.float32), radius=2),
+]
+
+needs_bokeh = pytest.mark.skipif(find_spec("bokeh") is None, reason="the extra plot is not installed")
+
+
+@pytest.fixture(scope="module")
+def digits(tmp_path_factory):
+    """Simulated digits, the first twelve of them held out."""
+    return tiny.write_digits(tmp_path_factory.mktemp("digits") / "digits.mcap", 80, n_held_out=12)
+
+
+@pytest.fixture(scope="module")
+def animals(tmp_path_factory):
+    """Samples of three classes that look alike, the first six held out."""
+    items = held_out(tiny.labelled_items(30), 6)
+    return tiny.write_items(tmp_path_factory.mktemp("animals") / "animals.mcap", items)
+
+
+@pytest.fixture(scope="module")
+def unsplit(tmp_path_factory):
+    """Samples of three classes without a held-out split."""
+    return tiny.write_items(tmp_path_factory.mktemp("unsplit") / "unsplit.mcap", tiny.labelled_items(18))
+
+
+def held_out(items, n):
+    """The same items with the first samples in a split for tests."""
+    first = [item.start_us for item in items if isinstance(item, Label)][:n]
+    return [
+        replace(item, split="test") if isinstance(item, Label) and item.start_us in first else item
+        for item in items
+    ]
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(cli.app, ["evaluate", *map(str, arguments)])
+
+
+def refused(*arguments):
+    """The one line that refuses these arguments."""
+    error = invoke(*arguments).exception
+    assert isinstance(error, InputError), error
+    assert "\n" not in str(error)
+    return str(error)
+
+
+# --- splits
+
+
+def test_a_held_out_split_is_the_one_fold(digits):
+    data = DataSet([digits], None, 5, 0)
+    assert (data.held_out_split, data.n_folds) == (True, 1)
+    with data.open(0) as (recording,):
+        assert [label.split for label in recording.labels] == ["test"] * 12 + ["train"] * 68
+
+
+def test_folds_hold_out_each_sample_once_and_every_class_evenly(unsplit):
+    data = DataSet([unsplit, unsplit], None, 3, 0)
+    assert data.n_folds == 3
+    held_out = []
+    for fold in range(3):
+        with data.open(fold) as recordings:
+            every = [sample.label for recording in recordings for sample in recording.samples()]
+        test = [i for i, label in enumerate(every) if label.split in HELD_OUT_SPLITS]
+        names = [every[i].label for i in test]
+        assert [names.count(name) for name in ("cat", "dog", "owl")] == [4, 4, 4]
+        held_out += test
+    assert sorted(held_out) == list(range(36))
+
+
+def test_nothing_is_learned_from_what_is_held_out(tmp_path):
+    items = held_out(tiny.labelled_items(6), 1)
+    large = [replace(item, resolution=(90, 90)) if 0 < i < 3 else item for i, item in enumerate(items)]
+    path = tiny.write_items(tmp_path / "large.mcap", large)
+    with open_recording(path) as recording:
+        assert next(recording.samples()).resolution == (90, 90)
+        assert AveragedSurfaces.fitted([recording]).resolution == tiny.RESOLUTION
+
+
+@pytest.mark.parametrize(
+    ("items", "folds", "what"),
+    [
+        ([tiny.packet(tiny.steady(0, 9, 5))], 5, "has no labelled samples"),
+        (tiny.labelled_items(6, names=("cat",)), 5, "all samples are labelled 'cat'"),
+        (tiny.labelled_items(6, names=("cat", "")), 2, "3 of 6 samples have no label, the first is sample 1"),
+        (tiny.labelled_items(6), 0, "--folds 0 leaves nothing to score"),
+        (tiny.labelled_items(6), 5, "label 'cat' has 2 samples, fewer than 5 folds"),
+    ],
+)
+def test_data_that_cannot_be_split(tmp_path, items, folds, what):
+    path = tiny.write_items(tmp_path / "bad.mcap", items)
+    assert what in refused(path, "--folds", folds)
+
+
+def test_only_held_out_samples_are_refused(tmp_path):
+    path = tiny.write_digits(tmp_path / "test.mcap", 12, split="test")
+    assert "every sample is of a held-out split" in refused(path)
+
+
+# --- what is planned
+
+
+def test_cells_are_the_base_and_one_change_at_a_time():
+    base = Setting(filters=7)
+    cells = plan_cells(["direct", "hats"], base, [parse_sweep("bins=2,4"), parse_sweep("max-count=2")], 2)
+    got = [(cell.method, cell.swept, cell.setting.bins, cell.setting.max_count, cell.fold) for cell in cells]
+    assert got == [
+        ("direct", "", 3, 1, 0),
+        ("direct", "", 3, 1, 1),
+        ("hats", "", 3, 1, 0),
+        ("hats", "", 3, 1, 1),
+        ("direct", "bins", 2, 1, 0),
+        ("direct", "bins", 2, 1, 1),
+        ("direct", "bins", 4, 1, 0),
+        ("direct", "bins", 4, 1, 1),
+        ("direct", "max_count", 3, 2, 0),
+        ("direct", "max_count", 3, 2, 1),
+    ]
+    assert {cell.setting.filters for cell in cells} == {7}
+
+
+@pytest.mark.parametrize(
+    ("option", "what"),
+    [
+        (["--method", "magic"], "method 'magic' is unknown; choose from direct"),
+        (["--sweep", "depth=1,2"], "'depth' cannot be swept; choose one of filters"),
+        (["--sweep", "bins"], "give positive integers, such as --sweep bins=2,4,7"),
+        (["--sweep", "bins=2,0"], "give positive integers"),
+        (["--sweep", "bins=2,,3"], "give positive integers"),
+        (["--early-samples", "-1"], "--early-samples -1"),
+        (["--seed", "-1"], "--seed -1"),
+        (["--report", "page.pdf"], "give a name that ends in .html"),
+        (["--method", "kmeans", "--volumes", "100"], "100 volumes are too few"),
+    ],
+)
+def test_options_that_cannot_be(digits, option, what):
+    assert what in refused(digits, *option)
+
+
+# --- baselines
+
+
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda b: type(b).__name__)
+def test_a_baseline_sees_the_events_of_its_window_in_any_order(baseline):
+    events = tiny.steady(1000, 90_000, 300)
+    rows = baseline.encode(events[events["t"] <= 50_000], tiny.RESOLUTION, origin_us=1000)
+    assert rows.shape == (baseline.n_features,)
+    assert rows.dtype == np.float32
+    assert rows.any()
+    shuffled = np.random.default_rng(1).permutation(events)
+    cut = baseline.encode(shuffled, tiny.RESOLUTION, origin_us=1000, t_us=50_000)
+    np.testing.assert_allclose(cut, rows, rtol=1e-6)
+    none = baseline.encode(events[:0], tiny.RESOLUTION, origin_us=0, t_us=10)
+    np.testing.assert_array_equal(none, np.zeros(baseline.n_features))
+
+
+def test_count_images_count_by_polarity_and_place():
+    events = make_events([0, 15, 15], [0, 11, 11], [1, 0, 0], [1, 2, 3])
+    image = CountImage(2).encode(events, (12, 16)).reshape(2, 2, 2)
+    assert image.tolist() == [[[0, 0], [0, 2]], [[1, 0], [0, 0]]]
+
+
+def test_averaged_surfaces_of_three_events():
+    # Two ON events of one pixel and one beside it, in one cell; an OFF event has no ON past.
+    events = make_events([1, 1, 2, 2], [1, 1, 1, 1], [1, 1, 1, 0], [0, 10, 20, 30])
+    hats = AveragedSurfaces((4, 4), cell=4, radius=1, tau_us=10.0).encode(events, (4, 4), origin_us=0)
+    expected = np.zeros((2, 3, 3))
+    expected[1, 1, 1] = np.exp(-1) / 4  # the second sees the first
+    expected[1, 1, 0] = (np.exp(-2) + np.exp(-1)) / 4  # the third sees both, one column to the left
+    np.testing.assert_allclose(hats.reshape(2, 3, 3), expected, rtol=1e-6)
+
+
+def test_averaged_surfaces_end_at_their_cell():
+    events = make_events([3, 4], [0, 0], [1, 1], [0, 1])
+    hats = AveragedSurfaces((4, 8), cell=4, radius=1).encode(events, (4, 8))
+    assert not hats.any()
+
+
+def test_a_histogram_of_surfaces_counts_each_event_in_its_quadrant():
+    alone = np.zeros((2, 2, 3, 3), np.float32)
+    alone[0, 0, 1, 1] = alone[1, 1, 1, 1] = 1  # an OFF event, an ON event, and nothing else around
+    hots = SurfaceHistogram(alone.reshape(2, 18), radius=1)
+    events = make_events([0, 7, 7, 0], [0, 0, 7, 7], [0, 1, 1, 0], [0, 1, 2, 3])
+    counts = hots.encode(events, (8, 8)).reshape(2, 2, 2)
+    assert counts.tolist() == [[[1, 0], [0, 1]], [[1, 0], [0, 1]]]
+
+
+def test_surface_prototypes_are_the_same_from_the_same_seed(digits):
+    with open_recording(digits) as recording:
+        first, again = (SurfaceHistogram.fitted([recording], 8, 500, seed=3) for _ in range(2))
+    assert first.prototypes.shape == (8, 98)
+    assert first.fingerprint == again.fingerprint
+
+
+def test_spherical_means_find_the_directions_of_the_data():
+    rng = np.random.default_rng(0)
+    directions = np.linalg.qr(rng.standard_normal((20, 4)))[0].T
+    x = directions[rng.integers(0, 4, 2000)] * rng.choice([-3, 3], (2000, 1))
+    x = x + 0.05 * rng.standard_normal(x.shape)
+    found = spherical_means(LazyVolumes(x.astype(np.float32), lambda rows: rows), 12, rng)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
+    assert (np.abs(found @ directions.T).max(axis=0) > 0.95).all()
+
+
+def test_random_filters_are_directions():
+    filters = random_filters(50, 30, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(filters, axis=1), 1, rtol=1e-5)
+    assert np.abs(filters @ filters.T - np.eye(50)).max() < 0.9
+
+
+# --- scores
+
+
+def test_the_bootstrap_interval_is_that_of_resampled_samples():
+    hits = np.arange(200) < 170
+    rng = np.random.default_rng(1)
+    means = [rng.choice(hits, 200).mean() for _ in range(4000)]
+    np.testing.assert_allclose(
+        scores.bootstrap_interval(170, 200), np.percentile(means, (2.5, 97.5)), atol=0.006
+    )
+    assert scores.bootstrap_interval(7, 7) == (1, 1)
+
+
+def test_the_interval_of_folds_is_students():
+    values = [0.8, 0.9, 0.85, 0.7]
+    expected = student.interval(0.95, 3, np.mean(values), np.std(values, ddof=1) / 2)
+    np.testing.assert_allclose(scores.fold_interval(values), expected)
+
+
+def test_confusion_has_true_labels_in_rows():
+    matrix = scores.confusion(["a", "a", "b", "c"], ["a", "b", "b", "a"], ["a", "b", "c"])
+    assert matrix == [[1, 1, 0], [0, 1, 0], [1, 0, 0]]
+
+
+def test_a_share_is_reached_where_accuracy_stays_above_it():
+    points = [{"ms": ms, "accuracy": a} for ms, a in ((1, 0.9), (2, 0.5), (3, 0.75), (4, 0.7), (5, 0.8))]
+    assert scores.time_to_share(points, "ms", 0.9) == 5
+    assert scores.time_to_share(points, "ms", 0.85) == 3
+    assert scores.time_to_share(points, "ms", 0.1) == 1
+
+
+def some_samples(n=6):
+    """Samples of three classes, in memory, events out of order."""
+    rng = np.random.default_rng(0)
+    made = []
+    for i in range(n):
+        start = 200_000 * i
+        events = rng.permutation(tiny.steady(start, start + 100_000, 60 + 30 * i, seed=i))
+        made.append(Sample(Label(start, 100_000, ("cat", "dog", "owl")[i % 3]), events, tiny.RESOLUTION))
+    return made
+
+
+def test_early_decisions_see_what_an_engine_has_seen():
+    model = tiny.encoder()
+    classifier, samples = tiny.classifier(model), some_samples()
+    early = scores.early_decision(model, classifier, samples)
+
+    def accuracy(cut):
+        return np.mean([cut(s) == s.label.label for s in samples])
+
+    def predict(sample, events, t_us):
+        return classifier.predict(
+            model.encode(events, sample.resolution, origin_us=sample.label.start_us, t_us=t_us)
+        )
+
+    for point in early["time"]:
+        ends = {s.label.start_us: s.label.start_us + int(1000 * point["ms"]) for s in samples}
+
+        def in_time(s, ends=ends):
+            end = ends[s.label.start_us]
+            return predict(s, s.events[s.events["t"] < end], end - 1)
+
+        assert point["accuracy"] == accuracy(in_time)
+    for point in early["events"]:
+
+        def in_number(s, n=point["events"]):
+            if n >= len(s.events):
+                return predict(s, s.events, s.label.start_us + 99_999)
+            first = np.sort(s.events, order="t")[:n]
+            return predict(s, first, int(first["t"][-1]))
+
+        assert point["accuracy"] == accuracy(in_number)
+    assert [point["events"] for point in early["events"]] == [50, 100, 200, 210]
+    assert early["time"][-1] == {"ms": 100, "accuracy": early["events"][-1]["accuracy"]}
+
+
+def test_prequential_accuracy_predicts_before_it_learns():
+    model = tiny.encoder(k=2)
+    rng = np.random.default_rng(0)
+    labels = rng.choice(["cat", "dog"], 300).tolist()
+    rows = rng.standard_normal((300, model.n_features)).astype(np.float32)
+    rows[:, 0] += np.where(np.array(labels) == "cat", 4, -4)
+    online = OnlineClassifier(Classifier.untrained(labels, model))
+    right = 0
+    for row, label in zip(rows, labels, strict=True):
+        right += online.predict_one(row) == label
+        online.learn_one(row, label)
+    result = scores.prequential(model, rows, labels)
+    assert result["accuracy"] == pytest.approx(right / 300, abs=1e-4)
+    assert 0.8 < result["accuracy"] < 1
+    assert result["curve"][-1] == {"samples": 300, "accuracy": result["accuracy"]}
+    assert result["label_changes"] == sum(a != b for a, b in itertools.pairwise(labels))
+
+
+def test_a_sorted_stream_says_that_it_is_easy():
+    model = tiny.encoder(k=2)
+    rows = np.random.default_rng(0).random((64, model.n_features), np.float32)
+    result = scores.prequential(model, rows, ["cat"] * 32 + ["dog"] * 32)
+    assert result["label_changes"] == 1
+
+
+def test_a_baseline_trains_the_same_classifier():
+    rows = np.stack([BASELINES[0].encode(s.events, s.resolution) for s in some_samples(30)])
+    trained = train_classifier(rows, [s.label.label for s in some_samples(30)], BASELINES[0])
+    assert trained.fingerprint == BASELINES[0].fingerprint
+    assert len(scores.predict_all(trained, rows)) == 30
+
+
+def test_peak_memory_is_of_the_block():
+    def grown(megabytes):
+        with PeakMemory() as memory:
+            np.ones(megabytes * 125_000)
+        return memory.peak_mb
+
+    if sys.platform != "linux":
+        pytest.skip("only Linux forgets an earlier peak")
+    assert grown(400) - grown(1) > 300
+
+
+# --- runs that go on
+
+
+HEADER = {"format": "test", "version": 1}
+CELL = Cell("counts", Setting(), 0)
+RESULT = {"right": 3, "samples": [4, 5], "confusion": [[1]]}
+
+
+def test_a_cell_is_kept_and_found_again(tmp_path):
+    path = tmp_path / "state.part"
+    StateFile(path, HEADER).add(CELL, RESULT)
+    again = StateFile(path, HEADER)
+    assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
+    assert again.get(replace(CELL, fold=1)) is None
+    assert again.get(replace(CELL, setting=Setting(bins=4))) is None
+
+
+def test_a_line_that_was_being_written_is_dropped(tmp_path):
+    path = tmp_path / "state.part"
+    StateFile(path, HEADER).add(CELL, RESULT)
+    whole = path.read_bytes()
+    for cut in range(1, len(whole), 41):
+        path.write_bytes(whole[:cut])
+        state = StateFile(path, HEADER)
+        assert len(state) == 0
+        state.add(CELL, RESULT)
+        assert path.read_bytes() == whole
+
+
+def test_the_state_of_another_run_is_refused(tmp_path):
+    path = tmp_path / "state.part"
+    StateFile(path, HEADER)
+    with pytest.raises(InputError, match="of a run with other recordings"):
+        StateFile(path, {**HEADER, "version": 2})
+    path.write_bytes(json.dumps(HEADER).encode() + b'\n{"cell": 1}\n')
+    with pytest.raises(InputError, match="line 2 cannot be read"):
+        StateFile(path, HEADER)
+
+
+def test_an_interrupted_run_goes_on(animals, tmp_path):
+    output = tmp_path / "result.json"
+    arguments = ["evaluate", animals, *QUICK, "--early-samples", "0", "-o", output]
+    for method in ("counts", "direct", "inverse", "kmeans", "random", "hats", "hots"):
+        arguments += ["--method", method]
+    command = [sys.executable, "-c", "from streamfeat.cli import main; main()", *map(str, arguments)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, "NO_COLOR": "1"})
+    state = state_path(output)
+    deadline = time.monotonic() + 200
+    while not (state.exists() and state.read_bytes().count(b"\n") >= 2):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 130
+    assert f"the same command goes on from {state}" in said.decode()
+    assert not output.exists()
+    done = [json.loads(line) for line in state.read_bytes().splitlines()[1:]]
+    assert 1 <= len(done) < 7
+
+    again = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+    assert again.exit_code == 0, again.output
+    result = json.loads(output.read_bytes())
+    assert [row["method"] for row in result["rows"]] == [*arguments[arguments.index("--method") + 1 :: 2]]
+    for kept, row in zip(done, result["rows"], strict=False):
+        assert kept["cell"]["method"] == row["method"]
+        assert kept["result"]["encode_s"] == row["encode_s"]  # not measured anew
+    assert not state.exists()
+
+
+# --- how it is shown
+
+
+@needs_bokeh
+def test_all_methods_in_tables_json_and_page(animals, tmp_path):
+    output, page = tmp_path / "result.json", tmp_path / "result.html"
+    every = [argument for method in METHODS for argument in ("--method", method)]
+    run = invoke(
+        animals, *QUICK, *every, "--sweep", "filters=12,14", "--sweep", "patch=3",
+        "--early-samples", "4", "-o", output, "--report", page, "--json",
+    )  # fmt: skip
+    assert run.exit_code == 0, run.output
+    result = json.loads(output.read_bytes())
+    assert json.loads(run.stdout) == result
+    base = [row for row in result["rows"] if not row["swept"]]
+    assert [row["method"] for row in base] == list(METHODS)
+    for row in result["rows"]:
+        assert 0 <= row["low"] <= row["accuracy"] <= row["high"] <= 1
+        assert np.trace(row["confusion"]) == round(6 * row["accuracy"])
+        assert np.sum(row["confusion"]) == 6
+        assert min(row["learn_s"], row["encode_s"], row["train_s"]) >= 0
+        assert row["peak_mb"] > 50
+    for row in base:
+        assert row["early"]["samples"] == 4
+        assert row["share_reached"]["ms"] <= 80
+        assert row["prequential"]["stream"]["curve"][-1]["samples"] == 30
+    same = [row for row in result["rows"] if row["method"] == "direct" and row["setting"]["filters"] == 12]
+    assert same[0]["accuracy"] == same[1]["accuracy"]
+    assert base[0]["learned"]["shape"] == [2, 4, 4]
+    assert len(base[0]["learned"]["objective"]) == 4
+    html = page.read_text()
+    for title in ("Accuracy", "Sweeps", "Early decision", "Online", "Confusion", "Convergence", "Filters"):
+        assert f"<h2>{title}" in html
+    assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', html)  # nothing from elsewhere
+    assert "N-Caltech101" in html
+
+    assert "exists already" in refused(animals, "-o", output)
+
+
+def test_folds_and_the_papers_figures_in_the_terminal(unsplit):
+    run = invoke(
+        unsplit, "--patch", "4", "--bins", "2", "--filters", "4", "--volumes", "300", "--iterations", "1",
+        "--folds", "2", "--early-samples", "3", "--method", "direct", "--sweep", "bins=2",
+    )  # fmt: skip
+    assert run.exit_code == 0, run.output
+    assert "2 stratified folds (Student's t)" in " ".join(run.stdout.split())
+    line = next(line.split() for line in run.stdout.splitlines() if line.startswith("7 "))
+    assert line == ["7", "0.771", "0.784"]  # not measured here: only the paper's direct and inverse
+
+
+def test_the_papers_tables_meet_in_one_setting():
+    middle = [
+        published.PAPER_SWEEPS[name][value] for name, value in (("filters", 1700), ("patch", 12), ("bins", 7))
+    ]
+    assert middle == [{"inverse": 0.784, "direct": 0.771}] * 3
+
+
+def test_filters_are_drawn_with_their_bins_side_by_side():
+    filters = np.zeros((9, 2 * 2 * 3))
+    filters[0, 0] = 2.0  # bin 0, first row, first column
+    filters[8, -1] = -0.5  # bin 1, last row, last column
+    picture = tiled(filters, (2, 2, 3))
+    tile = np.full((2, 7), 128)
+    tile[:, 3] = 255  # the gap between bins
+    first, last = tile.copy(), tile.copy()
+    first[0, 0], last[1, 6] = 255, 1
+    np.testing.assert_array_equal(picture[:2, :7], first)
+    np.testing.assert_array_equal(picture[4:6, :7], last)
