@@ -8,6 +8,14 @@ again. Done when somebody next reads, that is the longest wait of the whole syst
 it over the bin before: what volumes will be after the boundary is prepared beside what they are now.
 A volume enters in two steps. Once it is projected an event costs it one more column; only once it is coded
 does it cost a second code, so codes come last, shortly before the boundary.
+
+What was compared, at K = 1700, 7 bins, stride 4, N-CARS at recorded order; p50, p99 and p99.9 of one
+event in us. One plane, rebuilt by the first event of a bin: 3.4, 10, 770, and 10 ms at worst. Looking
+ahead in slices of 96 columns an event: 8.8, 43, 82. Slices of 24 columns, and more only where a bin is
+behind its pace: 7.8, 24, 38; this is kept (`tools/bench`, part `latency`, measures it and the first). A
+projection for each bin to come was not built: it adds a column for every bin to every event and holds T
+times the memory, and codes and pooled sums would still all change at the boundary. A plane that is not
+complete when its bin begins is completed then.
 """
 
 import numpy as np
