@@ -14,7 +14,19 @@ from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random
 from streamfeat.engine import Engine
 from streamfeat.events import EVENT_DTYPE
 from streamfeat.geometry import Geometry
-from streamfeat.kernels import code, decode, encode, follow, ingest, lasso, planes, surfaces, update, volume
+from streamfeat.kernels import (
+    change,
+    code,
+    decode,
+    encode,
+    follow,
+    ingest,
+    lasso,
+    planes,
+    surfaces,
+    update,
+    volume,
+)
 from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
@@ -909,9 +921,9 @@ KERNELS = [
     Row(update.finish, make_finish),
     Row(update.update, make_update, exact_but_atoms),
     Row(update.read, make_read, exact_but_features),
-    Row(follow.change_volume, make_change_volume, exact_but_scratch),
-    Row(follow.move_volume, make_move_volume, exact_but_scratch),
-    Row(follow.change_place, make_change_place, exact_but_atoms),
+    Row(change.change_volume, make_change_volume, exact_but_scratch),
+    Row(change.move_volume, make_move_volume, exact_but_scratch),
+    Row(change.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
     Row(follow.trace, make_trace, exact_but_features),

@@ -586,7 +586,7 @@ def read(shape, operator, state, features):
     read_features(operator, state, features)
 
 
-# streamfeat.kernels.follow
+# streamfeat.kernels.change
 
 
 def change_volume(plane, volume, entry, change, shape, operator, state):
@@ -606,6 +606,9 @@ def change_place(position, row, column, shape, operator, state):
     for plane, volume, values in list(_changed_volumes(after, shape, operator, state)):
         _follow_volume(plane, volume, values, 0, shape, operator, state)
     state.applied[:] = after
+
+
+# streamfeat.kernels.follow
 
 
 def follow(events, shape, operator, state):

@@ -25,7 +25,7 @@ LAYERS = [
     },
     {"kernels.encode", "codecs", "safe_arrays"},
     {"kernels.planes", "packets"},
-    {"kernels.update"},
+    {"kernels.change", "kernels.update"},
     {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
