@@ -155,24 +155,25 @@ def test_other_domains_and_other_types_are_not_heard(model):
 def test_topics_of_both_kinds_are_found():
     port = free_port()
     gid = "ab" * 16
-    with plain_session(port, listen=True) as net, plain_session(port) as other:
-        tokens = [
-            other.liveliness().declare_token(token)
-            for token in (
-                TOKEN,
-                TOKEN.replace("/10/MP", "/11/MP"),
-                TOKEN.replace("EventPacket_", "Imu_"),
-                TOKEN.replace("/MP/", "/MS/"),
-                TOKEN.replace("@ros2_lv/0/", "@ros2_lv/7/"),
-                f"{PlainNames('x').token('robot/cam0/events', bytes.fromhex(gid))}",
-            )
-        ]
-        found = until(lambda: len(topics := find_topics(net, 0.05)) == 3 and topics)
-        assert found == [
-            FoundTopic("/event_camera/events", "ros2", 0, 2),
-            FoundTopic("/event_camera/events", "ros2", 7, 1),
-            FoundTopic("robot/cam0/events", "zenoh", -1, 1),
-        ]
-        for token in tokens:
-            token.undeclare()
+    with plain_session(port, listen=True) as net:
+        with plain_session(port) as other:
+            tokens = [
+                other.liveliness().declare_token(token)
+                for token in (
+                    TOKEN,
+                    TOKEN.replace("/10/MP", "/11/MP"),
+                    TOKEN.replace("EventPacket_", "Imu_"),
+                    TOKEN.replace("/MP/", "/MS/"),
+                    TOKEN.replace("@ros2_lv/0/", "@ros2_lv/7/"),
+                    f"{PlainNames('x').token('robot/cam0/events', bytes.fromhex(gid))}",
+                )
+            ]
+            found = until(lambda: len(topics := find_topics(net, 0.05)) == 3 and topics)
+            assert found == [
+                FoundTopic("/event_camera/events", "ros2", 0, 2),
+                FoundTopic("/event_camera/events", "ros2", 7, 1),
+                FoundTopic("robot/cam0/events", "zenoh", -1, 1),
+            ]
+            assert len(tokens) == 6
+        # Whoever published them has left, and its tokens with it.
         until(lambda: find_topics(net, 0.05) == [])
