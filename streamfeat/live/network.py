@@ -35,6 +35,9 @@ _MAX_MESSAGE_BYTES = 16 << 20
 _QUEUED_BATCHES = 16
 """Of 64 kB, the most that zenoh allows: a reader that hesitates costs a camera nothing yet."""
 _PATIENCE = {"drop": {"wait_before_drop": 50_000}, "block": {"wait_before_close": 60_000_000}}
+_NO_SHARED_MEMORY = '{"enabled": false}'
+"""zenoh puts messages above 3 kB there by itself, and takes them back from a reader that hesitates for some
+seconds, without a word to either side. Sockets wait; up to 64 kB they are as quick."""
 """Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
 _HISTORY = 256
 """Packets that a reliable subscriber asks a publisher for when it joins late."""
@@ -45,7 +48,8 @@ def open_session(config: Path | None = None, *, port: int = DEFAULT_PORT) -> zen
 
     Args:
         config: JSON5 configuration of zenoh, used as it is, but that messages are given timestamps, which
-            recovering lost ones needs; without it, this machine alone.
+            recovering lost ones needs, and that none go through shared memory; without it, this machine
+            alone.
         port: where sessions on this machine meet; only without `config`.
 
     Raises:
@@ -54,6 +58,7 @@ def open_session(config: Path | None = None, *, port: int = DEFAULT_PORT) -> zen
     if config:
         try:
             chosen = zenoh.Config.from_file(config)
+            chosen.insert_json5("transport/shared_memory", _NO_SHARED_MEMORY)
             chosen.insert_json5("timestamping", "{enabled: true}")
             return zenoh.open(chosen)
         except (zenoh.ZError, OSError) as error:
@@ -82,6 +87,7 @@ def _loopback(listen: list[str], connect: list[str]) -> zenoh.Config:
                 },
                 "scouting": {"multicast": {"enabled": False}},
                 "timestamping": {"enabled": True},
+                    "shared_memory": json.loads(_NO_SHARED_MEMORY),
                 "transport": {
                     "link": {
                         "rx": {"max_message_size": _MAX_MESSAGE_BYTES},
