@@ -5,7 +5,7 @@ import random
 import pytest
 
 from streamfeat.live.clock import CameraClock
-from streamfeat.live.delivery import Delivery, DeliveryStats
+from streamfeat.live.delivery import Delivery, DeliveryStats, Verdict
 
 ONE, TWO = b"1" * 16, b"2" * 16
 SECOND = 1_000_000_000
@@ -64,8 +64,8 @@ def test_counts_are_true_for_any_order(seed):
 def test_what_we_dropped_is_not_lost_on_the_way():
     delivery = Delivery()
     delivery.see(ONE, 1, 0)
-    assert delivery.see(ONE, 1, 1) == (False, 0, False, False, False)
-    assert delivery.see(TWO, 1, 1) == (False, 0, False, False, True)
+    assert delivery.see(ONE, 1, 1) == Verdict(use=False)
+    assert delivery.see(TWO, 1, 1) == Verdict(use=False, foreign=True)
     verdict = delivery.see(ONE, 10, 1, dropped=5)
     assert (verdict.lost, verdict.broken) == (8, True)
     assert delivery.stats == DeliveryStats(received=2, lost=3, dropped=5, duplicates=1, foreign=1)
@@ -81,9 +81,21 @@ def test_a_publisher_that_restarts_is_followed():
 def test_a_publisher_whose_predecessor_left_need_not_wait():
     delivery, _ = feed([1, 2, 3])
     assert not delivery.see(TWO, 1, 4).use
-    delivery.left()
-    assert delivery.see(TWO, 2, 5).use
-    assert delivery.stats == DeliveryStats(received=4, foreign=1, restarts=1)
+    delivery.announced(here=False)
+    # Word that it left may overtake its last packets.
+    assert delivery.see(ONE, 4, 5) == Verdict(use=True)
+    delivery.announced(here=True)
+    assert delivery.see(TWO, 2, 6) == Verdict(use=True, broken=True, restarted=True, anew=True)
+    assert delivery.stats == DeliveryStats(received=5, foreign=1, restarts=1)
+
+
+def test_a_publisher_that_was_cut_off_and_is_back_stays():
+    delivery, _ = feed([1, 2, 3])
+    delivery.announced(here=False)
+    delivery.announced(here=True)
+    assert delivery.see(ONE, 4, 4) == Verdict(use=True)
+    assert delivery.see(TWO, 1, 5) == Verdict(use=False, foreign=True)
+    assert delivery.see(TWO, 2, SECOND).anew is False
 
 
 def test_two_publishers_on_one_key_the_first_stays():

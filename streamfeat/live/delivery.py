@@ -57,6 +57,7 @@ class Verdict(NamedTuple):
         lost: packets missing right before it.
         broken: it does not follow the one before, so a decoder cannot rely on what it remembers.
         restarted: its publisher is new or counts anew.
+        anew: it is the first since every publisher had left.
         foreign: it is of a second publisher.
     """
 
@@ -64,6 +65,7 @@ class Verdict(NamedTuple):
     lost: int = 0
     broken: bool = False
     restarted: bool = False
+    anew: bool = False
     foreign: bool = False
 
 
@@ -76,6 +78,8 @@ class Delivery:
         self._gid: bytes | None = None
         self._other: bytes | None = None
         self._heard_ns = 0
+        self._is_announced = True
+        self._have_left = False
         self._next = 0
         self._missing: dict[int, None] = {}
         self._old: list[int] = []
@@ -90,13 +94,16 @@ class Delivery:
             dropped: packets of this topic that were dropped since the one before.
         """
         self.stats.dropped += dropped
-        if self._gid is not None and gid != self._gid and now_ns - self._heard_ns < _SILENCE_NS:
+        is_other = self._gid is not None and gid != self._gid
+        if is_other and not self._have_left and now_ns - self._heard_ns < _SILENCE_NS:
             self._other = gid
             self.stats.foreign += 1
             return Verdict(use=False, lost=dropped, foreign=True)
         if gid != self._gid or self._counts_anew(seq):
             return self._take_over(gid, seq, now_ns, dropped)
         self._heard_ns = now_ns
+        # The last packets of those who have left may come after word of it.
+        self._have_left &= not self._is_announced
         gap = seq - self._next
         if gap < 0:
             return self._see_old(seq, dropped)
@@ -111,9 +118,10 @@ class Delivery:
             del self._missing[next(iter(self._missing))]
         return Verdict(use=True, lost=lost + dropped, broken=lost + dropped > 0)
 
-    def left(self) -> None:
-        """Every publisher has left: whoever comes next takes over at once."""
-        self._heard_ns = -_SILENCE_NS
+    def announced(self, *, here: bool) -> None:
+        """The first publisher has come, or the last has left: whoever comes next takes over at once."""
+        self._is_announced = here
+        self._have_left |= not here
 
     def _counts_anew(self, seq: int) -> bool:
         if abs(seq - self._next) > _FAR:
@@ -129,6 +137,7 @@ class Delivery:
         # Publishers count from 1, so of one that is new here the numbers before are missing.
         known = first or not gid or gid in (self._gid, self._other) or not 0 < seq <= _REMEMBERED
         lost = 0 if known else max(seq - 1 - dropped, 0)
+        anew, self._have_left = self._have_left and not first, False
         self._gid, self._heard_ns, self._next = gid, now_ns, seq + 1
         self._missing.clear()
         self._old.clear()
@@ -136,7 +145,7 @@ class Delivery:
         self.stats.lost += lost
         self.stats.unheard += max(seq - 1, 0) if first and gid else 0
         self.stats.restarts += not first
-        return Verdict(use=True, lost=lost + dropped, broken=not first, restarted=not first)
+        return Verdict(use=True, lost=lost + dropped, broken=not first, restarted=not first, anew=anew)
 
     def _see_old(self, seq: int, dropped: int) -> Verdict:
         if seq not in self._missing:

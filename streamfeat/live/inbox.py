@@ -13,9 +13,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass
 
-from streamfeat.cameras import Gone
-
-__all__ = ["Inbox", "RawMessage"]
+__all__ = ["Announcement", "Inbox", "RawMessage"]
 
 _MAX_BYTES = 64 << 20
 _OVERHEAD = 512
@@ -48,6 +46,14 @@ class RawMessage:
     dropped: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """The first publisher of a topic has come, or the last has left; it may overtake their packets."""
+
+    topic: str
+    here: bool
+
+
 class Inbox:
     """A bounded queue from many threads to one.
 
@@ -60,7 +66,7 @@ class Inbox:
         """Start empty and open."""
         self._max_bytes = max_bytes
         self._max_delay_ns = max_delay_s * 1e9
-        self._items: deque[RawMessage | Gone] = deque()
+        self._items: deque[RawMessage | Announcement] = deque()
         self._bytes = 0
         self._dropped: Counter[str] = Counter()
         self._changed = threading.Condition()
@@ -72,7 +78,7 @@ class Inbox:
         """Messages that wait."""
         return len(self._items)
 
-    def put(self, item: RawMessage | Gone) -> None:
+    def put(self, item: RawMessage | Announcement) -> None:
         """Add one at the end, and drop from the front while there is too much. Never waits."""
         with self._changed:
             if self._closed:
@@ -96,10 +102,10 @@ class Inbox:
         self._items.extendleft(reversed(kept))
 
     @staticmethod
-    def _arrived_ns(item: RawMessage | Gone) -> float:
+    def _arrived_ns(item: RawMessage | Announcement) -> float:
         return item.arrived_ns if isinstance(item, RawMessage) else math.inf
 
-    def take(self, timeout: float) -> list[RawMessage | Gone] | None:
+    def take(self, timeout: float) -> list[RawMessage | Announcement] | None:
         """Take what is there, at most 64; wait if there is nothing.
 
         Returns:

@@ -23,7 +23,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import Resolution
 from streamfeat.live.clock import CameraClock
 from streamfeat.live.delivery import Delivery, DeliveryStats
-from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.names import Attachment
 from streamfeat.messages import EventPacket, LabelMessage
 from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader, Tick
@@ -44,6 +44,8 @@ _IDLE_S = 0.25
 _FORGOTTEN_NS = 60_000_000_000
 SILENCE_S = 0.2
 """A camera that has been silent for so long is taken to have nothing to say, and its time goes on."""
+GRACE_S = 0.5
+"""Who leaves is released when nothing has come for so long: zenoh may tell of it before the last packets."""
 
 
 class Warnings:
@@ -135,6 +137,7 @@ class Intake:
         self.topics: dict[str, TopicState] = {}
         self._past = DeliveryStats()
         self._early: dict[str, Label] = {}
+        self._leaving: dict[str, float] = {}
 
     def __iter__(self) -> Iterator[Packet | Label | Tick | Gone | None]:
         """Yield items as they come; None when nothing more is there at the moment."""
@@ -144,7 +147,11 @@ class Intake:
                 yield from self._items(message)
             now = time.monotonic()
             # Time during which this process was stopped says nothing about a camera's silence.
-            yield from self._silences(min(now - looked, 2 * _POLL_S))
+            passed_s = min(now - looked, 2 * _POLL_S)
+            yield from self._silences(passed_s)
+            # Nor does that of those who leave begin before all that had arrived was looked at.
+            if not self._inbox.depth:
+                yield from self._releases(passed_s)
             looked = now
             yield None
 
@@ -155,24 +162,34 @@ class Intake:
             total += part
         return total
 
-    def _leave(self, topic: str) -> None:
+    def _announced(self, topic: str, *, here: bool) -> None:
+        """Publishers come or leave. Who comes next is heard at once; who left may have packets under way."""
+        self._leaving.pop(topic, None)
+        if not here:
+            self._leaving[topic] = 0.0
+            if len(self._leaving) > MAX_TOPICS:
+                del self._leaving[next(iter(self._leaving))]
+        if topic in self.topics:
+            self.topics[topic].delivery.announced(here=here)
+
+    def _release(self, topic: str, state: TopicState) -> Gone:
         """Nobody publishes here any more: what comes next is another life of this camera."""
-        state = self.topics.get(topic)
-        if state:
-            state.delivery.left()
-            state.reader = PacketReader(topic, MAX_PACKET_EVENTS)
-            state.clock = CameraClock(self._window_us)
-            state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
+        state.reader = PacketReader(topic, MAX_PACKET_EVENTS)
+        state.clock = CameraClock(self._window_us)
+        state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
+        return Gone(topic)
 
-    def _forget(self, topic: str) -> None:
-        state = self.topics.pop(topic, None)
-        if state:
-            self._past = self._past + state.delivery.stats
+    def _releases(self, passed_s: float) -> Iterator[Gone]:
+        for topic, silent_s in list(self._leaving.items()):
+            self._leaving[topic] = silent_s + passed_s
+            if silent_s > GRACE_S:
+                del self._leaving[topic]
+                if topic in self.topics:
+                    yield self._release(topic, self.topics[topic])
 
-    def _items(self, message: RawMessage | Gone) -> Iterator[Packet | Label | Tick | Gone]:
-        if isinstance(message, Gone):
-            self._leave(message.topic)
-            yield message
+    def _items(self, message: RawMessage | Announcement) -> Iterator[Packet | Label | Tick | Gone]:
+        if isinstance(message, Announcement):
+            self._announced(message.topic, here=message.here)
             return
         try:
             if message.schema == LabelMessage.SCHEMA_NAME:
@@ -209,8 +226,10 @@ class Intake:
         state.label_end_us = label.start_us + label.duration_us
         return replace(label, topic=topic)
 
-    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Tick]:
-        state = self._state(message.topic)
+    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Tick | Gone]:
+        if message.topic not in self.topics:
+            yield from self._begin(message.topic)
+        state = self.topics[message.topic]
         attachment = Attachment.unpack(message.attachment)
         numbered = attachment or self._number_in(message)
         verdict = state.delivery.see(numbered.gid, numbered.seq, message.arrived_ns, message.dropped)
@@ -218,11 +237,15 @@ class Intake:
             state.reader.resync()
         if verdict.restarted:
             self._warnings.add("publisher restarted", message.topic, f"now {numbered.gid.hex() or 'unnamed'}")
+            if verdict.anew:
+                yield self._release(message.topic, state)
         state.lost += verdict.lost
         if verdict.foreign:
             self._warnings.add("second publisher", message.topic, numbered.gid.hex() or "unnamed")
         if not verdict.use:
             return
+        if message.topic in self._leaving:
+            self._leaving[message.topic] = 0.0
         if verdict.lost:
             self._warnings.add(
                 "packets missing", message.topic, f"{verdict.lost} before number {numbered.seq}"
@@ -295,17 +318,16 @@ class Intake:
         reason = message.problem or "no sequence number"
         raise _RefusalError(reason, f"{len(message.attachment)} bytes of attachment")
 
-    def _state(self, topic: str) -> TopicState:
-        if topic not in self.topics:
-            if len(self.topics) >= MAX_TOPICS:
-                oldest = min(self.topics, key=lambda name: self.topics[name].heard_ns)
-                if time.monotonic_ns() - self.topics[oldest].heard_ns < _FORGOTTEN_NS:
-                    raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
-                self._inbox.put(Gone(oldest))
-                self._forget(oldest)
-            reader = PacketReader(topic, MAX_PACKET_EVENTS)
-            self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
-        return self.topics[topic]
+    def _begin(self, topic: str) -> Iterator[Gone]:
+        """Follow one topic more; the one that has been silent for longest makes room for it."""
+        if len(self.topics) >= MAX_TOPICS:
+            oldest = min(self.topics, key=lambda name: self.topics[name].heard_ns)
+            if time.monotonic_ns() - self.topics[oldest].heard_ns < _FORGOTTEN_NS:
+                raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
+            self._past = self._past + self.topics.pop(oldest).delivery.stats
+            yield Gone(oldest)
+        reader = PacketReader(topic, MAX_PACKET_EVENTS)
+        self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
 
     def _silences(self, passed_s: float) -> Iterator[Tick]:
         for topic, state in self.topics.items():

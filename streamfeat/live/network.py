@@ -20,9 +20,8 @@ import zenoh
 import zenoh.ext
 from zenoh.handlers import Callback
 
-from streamfeat.cameras import Gone
 from streamfeat.errors import InputError
-from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
 from streamfeat.packets import EVENT_SCHEMAS
@@ -35,10 +34,10 @@ _MAX_MESSAGE_BYTES = 16 << 20
 _QUEUED_BATCHES = 16
 """Of 64 kB, the most that zenoh allows: a reader that hesitates costs a camera nothing yet."""
 _PATIENCE = {"drop": {"wait_before_drop": 50_000}, "block": {"wait_before_close": 60_000_000}}
+"""Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
 _NO_SHARED_MEMORY = '{"enabled": false}'
 """zenoh puts messages above 3 kB there by itself, and takes them back from a reader that hesitates for some
 seconds, without a word to either side. Sockets wait; up to 64 kB they are as quick."""
-"""Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
 _HISTORY = 256
 """Packets that a reliable subscriber asks a publisher for when it joins late."""
 
@@ -58,8 +57,8 @@ def open_session(config: Path | None = None, *, port: int = DEFAULT_PORT) -> zen
     if config:
         try:
             chosen = zenoh.Config.from_file(config)
-            chosen.insert_json5("transport/shared_memory", _NO_SHARED_MEMORY)
             chosen.insert_json5("timestamping", "{enabled: true}")
+            chosen.insert_json5("transport/shared_memory", _NO_SHARED_MEMORY)
             return zenoh.open(chosen)
         except (zenoh.ZError, OSError) as error:
             raise InputError(f"{config}: zenoh cannot use this configuration: {_first_line(error)}") from None
@@ -87,12 +86,12 @@ def _loopback(listen: list[str], connect: list[str]) -> zenoh.Config:
                 },
                 "scouting": {"multicast": {"enabled": False}},
                 "timestamping": {"enabled": True},
-                    "shared_memory": json.loads(_NO_SHARED_MEMORY),
                 "transport": {
+                    "shared_memory": json.loads(_NO_SHARED_MEMORY),
                     "link": {
                         "rx": {"max_message_size": _MAX_MESSAGE_BYTES},
                         "tx": {"queue": {"size": {"data": _QUEUED_BATCHES}, "congestion_control": _PATIENCE}},
-                    }
+                    },
                 },
             }
         )
@@ -208,11 +207,13 @@ class Subscription:
             return
         if sample.kind == zenoh.SampleKind.PUT:
             self._publishers[topic] += 1
+            if self._publishers[topic] == 1:
+                self._inbox.put(Announcement(topic, here=True))
             return
         self._publishers[topic] -= 1
         if self._publishers[topic] <= 0:
             del self._publishers[topic]
-            self._inbox.put(Gone(topic))
+            self._inbox.put(Announcement(topic, here=False))
 
 
 @dataclass(frozen=True, slots=True, order=True)

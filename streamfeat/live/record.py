@@ -16,10 +16,9 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from streamfeat.cameras import Gone
 from streamfeat.errors import InputError
 from streamfeat.live.delivery import Delivery, DeliveryStats
-from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import MAX_TOPICS, Warnings
 from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
@@ -135,9 +134,9 @@ class Record:
         due = time.monotonic() + self._chunk_s
         while (taken := self._inbox.take(min(_POLL_S, self._chunk_s))) is not None:
             for message in taken:
-                if isinstance(message, Gone):
+                if isinstance(message, Announcement):
                     if message.topic in self._topics:
-                        self._topics[message.topic].left()
+                        self._topics[message.topic].announced(here=message.here)
                 elif self._is_wanted(message):
                     self._written[message.topic] += 1
                     self._bytes += len(message.payload)
