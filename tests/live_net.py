@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 import zenoh
 
-PATIENCE_S = float(os.environ.get("LIVE_PATIENCE_S", "30"))
+PATIENCE_S = float(os.environ.get("LIVE_PATIENCE_S", "120"))
+"""Kernels may have to be compiled first, on a machine that has other things to do."""
 
 
 def free_port():
@@ -21,11 +22,16 @@ def free_port():
 
 
 def until(condition, what="the condition"):
-    """Wait for a state; give up after a time that no healthy run needs."""
+    """Wait for a state; give up after a time that no healthy run needs, and say what was there instead.
+
+    Args:
+        condition: without arguments.
+        what: the state in words, or a function that gives them.
+    """
     limit = time.monotonic() + PATIENCE_S
     turn = threading.Event()
     while not (value := condition()):
-        assert time.monotonic() < limit, f"{what} did not come about"
+        assert time.monotonic() < limit, f"{what() if callable(what) else what} did not come about"
         turn.wait(0.002)
     return value
 
