@@ -8,6 +8,7 @@ from kernel_table import assert_certified, lasso_scratch, with_response
 from streams import GAP, random_encoder, random_events
 
 from streamfeat.engine import Engine
+from streamfeat.events import make_events
 from streamfeat.geometry import Geometry
 from streamfeat.kernels.lasso import CODE, RESPONSE, solve_lasso
 
@@ -45,6 +46,16 @@ def test_degenerate_problems_end_within_the_gap(seed, penalty):
             assert np.isfinite(kept).all(), name
             if x.any() or start is None:
                 assert reached <= GAP, name
+
+
+def test_slow_descent_goes_on_until_it_is_within_the_gap():
+    """Few dimensions, many atoms, a small penalty: codes change hands for tens of thousands of sweeps."""
+    geometry = Geometry(patch=2, stride=1, n_bins=1, bin_us=1)
+    encoder = random_encoder(np.random.default_rng(466), geometry, 33, "inverse", "split", threshold=0.02)
+    engine = Engine(encoder, (2, 2), origin_us=0, look_ahead=True)
+    engine.feed(make_events([0], [1], [1], [0]))
+    engine.features()
+    assert_certified(engine._operator, engine._state)
 
 
 def test_a_gap_below_float_rounding_ends():

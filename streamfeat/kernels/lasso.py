@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.layout import LANES, Operator
 
-MAX_ROUNDS = 1000
+MAX_ROUNDS = 4000
 """Working sets that are tried; reached only where the gap is below float rounding."""
 
 MAX_SWEEPS = 64
