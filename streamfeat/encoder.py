@@ -162,7 +162,7 @@ class Encoder:
 
     @property
     def n_features(self) -> int:
-        """Length of a feature vector: `4 K`, or `8 K` for `split`."""
+        """Length of a feature vector: `K` for each cell, or `2 K` for `split`."""
         return n_features(self.operator)
 
     def encode(

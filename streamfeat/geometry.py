@@ -22,6 +22,8 @@ class Geometry:
         bin_us: microseconds in a bin.
         downsample: sensor pixels along each side of a ring pixel.
         max_count: counts are clipped to `[-max_count, max_count]`.
+        pooling: cells along each side of the grid of volumes; codes are summed over each cell. Two is the
+            paper's: four quadrants.
 
     Raises:
         InputError: a value is out of range.
@@ -33,6 +35,7 @@ class Geometry:
     bin_us: int = 33_334
     downsample: int = 1
     max_count: int = 1
+    pooling: int = 2
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -43,6 +46,7 @@ class Geometry:
             "bin_us": 2**40,
             "downsample": 1024,
             "max_count": 2**15 - 1,
+            "pooling": 64,
         }
         for name, most in upper.items():
             value = getattr(self, name)

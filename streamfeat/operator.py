@@ -36,6 +36,7 @@ def fixed_fields(
         "downsample": geometry.downsample,
         "bin_us": geometry.bin_us,
         "max_count": geometry.max_count,
+        "pooling": geometry.pooling,
         "n_filters": filters.shape[0],
         "kind": kind,
         "inverse": inverse,
@@ -193,21 +194,22 @@ def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operato
 
     Args:
         operator: in units of one.
-        grid_shape: rows and columns of volumes; at most a quarter of them, rounded up, share a sum.
+        grid_shape: rows and columns of volumes; those of one cell share a sum.
 
     Raises:
         InputError: the pooled sums could overflow whatever the fixed point.
     """
     rows, columns = grid_shape
-    unit = 2.0 ** _fixed_point_bits(operator, -(-rows // 2) * -(-columns // 2))
+    volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling)
+    unit = 2.0 ** _fixed_point_bits(operator, volumes)
     offset = operator.offset * np.float32(unit)
     offset.flags.writeable = False
     return operator._replace(unit=unit, offset=offset, threshold=operator.threshold * unit)
 
 
 def n_features(operator: Operator) -> int:
-    """Length of the feature vector: four quadrants of `K` codes, or of `2 K` for `split`."""
-    return 4 * operator.n_filters * (2 if operator.kind == SPLIT else 1)
+    """Length of the feature vector: `pooling^2` cells of `K` codes, or of `2 K` for `split`."""
+    return operator.pooling**2 * operator.n_filters * (2 if operator.kind == SPLIT else 1)
 
 
 def _fixed_point_bits(operator: Operator, volumes: int) -> int:
@@ -215,7 +217,7 @@ def _fixed_point_bits(operator: Operator, volumes: int) -> int:
     bits = math.floor(math.log2(room)) if room > 0 else -1
     if not bits >= FEWEST_BITS:
         raise InputError(
-            f"a pooled code could reach {operator.largest:.4g} x {volumes} volumes of a quadrant, which "
+            f"a pooled code could reach {operator.largest:.4g} x {volumes} volumes of a cell, which "
             f"leaves {bits} bits behind the point of an int32, {FEWEST_BITS} are needed; raise the stride, "
             "the downsample, the threshold or eps_zca"
         )

@@ -208,9 +208,8 @@ class TerminalSink:
             if e.labels:
                 line.append(f"  {100 * self._correct / self._samples:.1f} % of {self._samples}", style="dim")
         elif e.prediction is None:
-            quadrants = e.features.reshape(4, -1)
-            line.append("by quadrant ", style="dim")
-            line.append(" ".join(f"{float(abs(q).sum()):9.1f}" for q in quadrants))
+            line.append("sum of features ", style="dim")
+            line.append(f"{float(abs(e.features).sum()):9.1f}")
         if e.incomplete:
             line.append("  incomplete", style="yellow")
         return line

@@ -71,7 +71,8 @@ def allocate_state(
         projections=np.zeros((planes, volumes, padded), np.int32),
         moments=np.zeros((planes, volumes, 4), np.int64),
         atoms=np.zeros((planes, volumes, 2, atoms), np.float64),
-        pooled=np.zeros((planes, 4, features), np.int32),
+        pooled=np.zeros((planes, operator.pooling**2, features), np.int32),
+        cells=_cells(operator.pooling, rows, columns),
         dirty=np.zeros(planes * volumes, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
         code=np.zeros((PARTS, 2, padded), np.int32),
@@ -82,6 +83,12 @@ def allocate_state(
         changes=np.zeros((PARTS, geometry.entries), np.int16),
         corners=np.zeros((PARTS, atoms * padded), np.float32),
     )
+
+
+def _cells(pooling: int, rows: int, columns: int) -> NDArray[np.int32]:
+    """Cell of each volume of a grid, row by row: the sides of the grid are cut into `pooling` equal parts."""
+    down, across = np.arange(rows) * pooling // rows, np.arange(columns) * pooling // columns
+    return np.add.outer(down * pooling, across).astype(np.int32).ravel()
 
 
 def _covering(geometry: Geometry, pixels: int, volumes: int) -> NDArray[np.int32]:

@@ -396,14 +396,19 @@ def list_changed(counts, applied, limit, slots, first_slot, end, top, left, patc
 # streamfeat.kernels.encode
 
 
-def lower_half(shape):
-    return math.ceil(shape[0] / 2) * shape[1]
+def lower_part(shape, pooling):
+    rows = [row for row in range(shape[0]) if cell((row, 0), shape, pooling)[0] < pooling / 2]
+    return len(rows) * shape[1]
 
 
-def quadrant(volume, shape):
-    row, column = divmod(volume, shape[1])
-    is_low, is_right = row >= shape[0] / 2, column >= shape[1] / 2
-    return [[0, 1], [2, 3]][is_low][is_right]
+def cell(place, shape, pooling):
+    """Row and column of the cell of a volume."""
+    return tuple(math.floor(index * pooling / side) for index, side in zip(place, shape, strict=True))
+
+
+def cell_index(volume, shape, pooling):
+    row, column = cell(divmod(volume, shape[1]), shape, pooling)
+    return row * pooling + column
 
 
 def encode_volume(projection, moments, atoms, fresh, part, operator, state):
@@ -428,13 +433,18 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
 def pool_volume(plane, row, volume, sign, part, shape, operator, state):
     row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
     encode_volume(*row_of, sign > 0, part, operator, state)
-    pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+    pool(
+        state.code[part, 0],
+        sign,
+        operator.kind,
+        state.pooled[plane, cell_index(volume, shape, operator.pooling)],
+    )
     state.encoded[part] += sign > 0
 
 
 def read_features(operator, state, features):
     pooled = state.pooled[int(state.clock[CLOCK_PLANE])].astype(np.int64)
-    parts = pooled.reshape(4, -1, len(operator.offset))[:, :, : operator.n_filters]
+    parts = pooled.reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
     if operator.kind == SPLIT:
         signed, absolute = parts[:, 0], parts[:, 1]
         parts = np.stack([(absolute + signed) / 2, (absolute - signed) / 2], axis=1)
@@ -475,7 +485,7 @@ def enter_code(plane, volume, part, shape, operator, state):
 
 
 def complete(part, shape, operator, state):
-    plane, half = int(state.clock[CLOCK_PLANE]), lower_half(shape)
+    plane, half = int(state.clock[CLOCK_PLANE]), lower_part(shape, operator.pooling)
     cursors, everything = state.cursors[plane], state.values.shape[1]
     for volume in [range(half), range(half, shape[0] * shape[1])][part]:
         if volume >= cursors[CURSOR_PROJECTED]:
@@ -556,7 +566,7 @@ def mark_dirty(shape, operator, state):
 
 def renew(part, shape, operator, state):
     for plane, volume, values in list(_changed_volumes(_clipped(operator, state), shape, operator, state)):
-        if part == (volume >= lower_half(shape)):
+        if part == (volume >= lower_part(shape, operator.pooling)):
             _follow_volume(plane, volume, values, part, shape, operator, state)
 
 
@@ -688,13 +698,14 @@ def codes_of(counts, encoder):
     return np.apply_along_axis(code_of, 2, local_volumes(counts, encoder.geometry), encoder)
 
 
-def features_from(codes, encoding):
-    """Codes summed over the four quadrants; positive and negative parts apart for `split`."""
+def features_from(codes, encoding, pooling=2):
+    """Codes summed over each cell; positive and negative parts apart for `split`."""
     if encoding == "split":
         codes = np.concatenate([codes.clip(0), (-codes).clip(0)], axis=2)
-    rows, columns = ((side + 1) // 2 for side in codes.shape[:2])
-    quadrants = codes[:rows, :columns], codes[:rows, columns:], codes[rows:, :columns], codes[rows:, columns:]
-    return np.concatenate([q.sum(axis=(0, 1)) for q in quadrants])
+    cells = np.zeros((pooling, pooling, codes.shape[2]))
+    for place in np.ndindex(codes.shape[:2]):
+        cells[cell(place, codes.shape[:2], pooling)] += codes[place]
+    return cells.ravel()
 
 
 # streamfeat.kernels.surfaces

@@ -70,6 +70,7 @@ def cases(draw, kind, max_bins=4):
         bin_us=draw(st.sampled_from([1, 7, 1000])),
         downsample=draw(st.integers(1, 3)),
         max_count=draw(st.sampled_from([1, 2, 3, 100])),
+        pooling=draw(st.sampled_from([2, 1, 3, 5])),
     )
     smallest = geometry.patch * geometry.downsample
     side = st.integers(smallest, smallest + 11)

@@ -183,7 +183,7 @@ def test_fewer_than_eight_bits_are_refused_with_the_arithmetic():
     most = (2**31 - 1) / 2**8 / 9
     assert with_fixed_point(operator._replace(largest=0.999 * most), (5, 6)).unit == 2.0**8
     message = refused(with_fixed_point, operator._replace(largest=1.001 * most), (5, 6))
-    assert f"could reach {1.001 * most:.4g} x 9 volumes of a quadrant" in message
+    assert f"could reach {1.001 * most:.4g} x 9 volumes of a cell" in message
     assert "leaves 7 bits behind the point of an int32, 8 are needed; raise the stride" in message
     assert "leaves -3 bits" in refused(with_fixed_point, operator._replace(largest=2.0**30), (5, 6))
     for largest in (float("inf"), float("nan")):
@@ -195,7 +195,7 @@ def test_a_sensor_of_too_many_volumes_is_refused():
     build_engine = lambda side: Engine(encoder, (side, side))  # noqa: E731
     assert build_engine(8)._operator.unit >= 2.0**8
     for make in (build_engine, lambda side: encoder.encode(EVENTS, (side, side))):
-        assert "volumes of a quadrant" in refused(make, 400)
+        assert "volumes of a cell" in refused(make, 400)
 
 
 def extreme_volumes(rng, operator, geometry):

@@ -88,7 +88,9 @@ def assert_agree(case, engine, features, counts, how):
     assert_pooled(engine.grid_shape, operator, engine._state)
     codes = np.trunc(engine.snapshot().atoms.astype(np.float64) * unit) / unit
     np.testing.assert_array_equal(engine.codes().reshape(codes.shape), codes.astype(np.float32))
-    expected = naive.features_from(codes.reshape(*engine.grid_shape, -1), case.encoding)
+    expected = naive.features_from(
+        codes.reshape(*engine.grid_shape, -1), case.encoding, case.geometry.pooling
+    )
     np.testing.assert_array_equal(mine, expected.astype(np.float32), err_msg=how)
     gram = case.encoder.operator.gram.astype(np.float64)
     if np.linalg.eigvalsh(gram).min() > 1e-3:
@@ -407,7 +409,7 @@ def test_codes_of_real_events_are_right_to_a_ten_thousandth(kind, digits):
         largest = np.abs(codes).max()
         assert largest > 0.1
         assert np.abs(engine.codes() - codes).max() <= 1e-4 * largest + 1 / engine._operator.unit
-        features = naive.features_from(codes, encoder.encoding)
+        features = naive.features_from(codes, encoder.encoding, encoder.geometry.pooling)
         offline = encoder.encode(events, (34, 34), origin_us=0)
         np.testing.assert_allclose(offline, features, atol=1e-4 * largest * len(codes) ** 2)
         assert offline.dtype == np.float32

@@ -8,7 +8,7 @@ import numpy as np
 
 from streamfeat.kernels.code import deviation, gain, move_code, move_triangle, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
-from streamfeat.kernels.encode import ADD, TAKE, pool_volume, quadrant
+from streamfeat.kernels.encode import ADD, TAKE, pool_volume
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.layout import (
     CLOCK_PLANE,
@@ -67,7 +67,7 @@ def move_volume(
     Args: as for `change_volume`.
     """
     projection, moments = state.projections[plane, volume], state.moments[plane, volume]
-    pooled, column = state.pooled[plane, quadrant(volume, shape)], operator.columns[entry]
+    pooled, column = state.pooled[plane, state.cells[volume]], operator.columns[entry]
     entries, eps = operator.columns.shape[0], operator.eps
     sigma = deviation(moments, entries, eps)
     if operator.kind == TRIANGLE:

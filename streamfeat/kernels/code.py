@@ -113,7 +113,7 @@ def fixed_distance(z: np.float32, length: np.float32, square_norm: np.float32, u
 
 @kernel
 def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32]) -> None:
-    """Add (`sign` 1) or take away (`sign` -1) the code of one volume from the sums of its quadrant.
+    """Add (`sign` 1) or take away (`sign` -1) the code of one volume from the sums of its cell.
 
     Args:
         code: `(Kp,)` fixed point; not changed.
@@ -155,7 +155,7 @@ def move_code(
         offset: `(Kp,)` of the operator.
         threshold: of the operator.
         kind: SOFT or SPLIT.
-        pooled: `(F,)` of the volume's quadrant, changed.
+        pooled: `(F,)` of the volume's cell, changed.
     """
     width = projection.shape[0]
     sums, sizes = pooled[:width], pooled[width:]
@@ -201,7 +201,7 @@ def move_triangle(
         norms: `(Kp,)` squared length of each filter.
         n_filters: of the operator.
         unit: of the fixed point.
-        pooled: `(Kp,)` of the volume's quadrant, changed.
+        pooled: `(Kp,)` of the volume's cell, changed.
         codes: `(2, Kp)` scratch.
     """
     step, old, new = np.int32(change), codes[0], codes[1]

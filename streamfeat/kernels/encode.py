@@ -1,6 +1,6 @@
 """One volume of a plane: where it lies, what its code is, and its part in the pooled sums.
 
-Lives here: the choice of the code that the operator asks for, pooling by quadrant, reading what is pooled.
+Lives here: the choice of the code that the operator asks for, pooling by cell, reading what is pooled.
 Not here: the codes themselves (`code`, `lasso`), and which volume is encoded when (`planes`, `update`).
 """
 
@@ -17,16 +17,9 @@ ADD, TAKE = np.int64(1), np.int64(-1)
 
 
 @inlined
-def lower_half(shape: tuple[int, int]) -> int:
-    """The first volume of the lower half of the grid: quadrants 2 and 3, and the second of the two parts."""
-    return (shape[0] + 1) // 2 * shape[1]
-
-
-@inlined
-def quadrant(volume: int, shape: tuple[int, int]) -> int:
-    """Quadrant of a volume: 0 top left, 1 top right, 2 bottom left, 3 bottom right."""
-    column = volume % shape[1]
-    return 2 * (volume >= lower_half(shape)) + (2 * column >= shape[1])
+def lower_part(shape: tuple[int, int], pooling: int) -> int:
+    """The first volume of the second of the two parts of the grid: the lower half of the rows of cells."""
+    return -(-((pooling + 1) // 2 * shape[0]) // pooling) * shape[1]
 
 
 @kernel
@@ -99,21 +92,22 @@ def pool_volume(
     if fresh:
         state.encoded[part] += 1
     if moments[MOMENT_SQUARES] != 0:
-        pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, quadrant(volume, shape)])
+        pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, state.cells[volume]])
 
 
 @kernel
 def read_features(operator: Operator, state: State, features: NDArray[np.float32]) -> None:
-    """Write the pooled sums of the current plane as floats, quadrant by quadrant and without padding.
+    """Write the pooled sums of the current plane as floats, cell by cell and without padding.
 
     Args:
         operator: number of filters, encoding and fixed point.
         state: not changed.
-        features: `(4 K,)`, or `(8 K,)` for SPLIT, positive parts before negative ones; overwritten.
+        features: `(cells * K,)`, or `(cells * 2 K,)` for SPLIT, in each cell positive parts before negative
+            ones; overwritten.
     """
     pooled, n = state.pooled[state.clock[CLOCK_PLANE]], operator.n_filters
     width, per_unit = operator.offset.shape[0], 1.0 / operator.unit
-    for q in range(4):
+    for q in range(pooled.shape[0]):
         if operator.kind == SPLIT:
             sums, sizes = pooled[q, :width], pooled[q, width:]
             positive, negative = features[2 * q * n : (2 * q + 1) * n], features[(2 * q + 1) * n :]

@@ -27,6 +27,7 @@ class Operator(NamedTuple):
     downsample: int
     bin_us: int
     max_count: int
+    pooling: int
     n_filters: int
     kind: int
     """One of SOFT, SPLIT, TRIANGLE."""
@@ -112,8 +113,10 @@ class State(NamedTuple):
     """`(planes, V, 2, K)`: the last lasso code of every volume, from which the next is started, and its
     response, the Gram matrix times the code."""
     pooled: NDArray[np.int32]
-    """`(planes, 4, F)`: fixed-point codes summed over each quadrant. `F` is Kp, or 2 Kp for SPLIT: sums of
+    """`(planes, cells, F)`: fixed-point codes summed over each cell. `F` is Kp, or 2 Kp for SPLIT: sums of
     codes, then of their absolute values (the positive and negative parts are half the sum and difference)."""
+    cells: NDArray[np.int32]
+    """`(V,)`: cell of each volume."""
     dirty: NDArray[np.int32]
     """`(planes * V,)`: volumes to encode again, by `plane * V + volume`; a stack."""
     is_dirty: NDArray[np.uint8]
@@ -135,7 +138,7 @@ class State(NamedTuple):
 
 
 PARTS = 2
-"""The upper and the lower half of the grid of volumes."""
+"""The upper and the lower half of the rows of cells."""
 
 CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE, CLOCK_DIRTY, CLOCK_SLOT = range(7)
 """Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane; height

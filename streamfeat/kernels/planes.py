@@ -21,7 +21,7 @@ complete when its bin begins is completed then.
 import numpy as np
 
 from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, lower_half, pool_volume
+from streamfeat.kernels.encode import ADD, lower_part, pool_volume
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.lasso import respond
 from streamfeat.kernels.layout import (
@@ -130,7 +130,7 @@ def complete(part: int, shape: tuple[int, int], operator: Operator, state: State
         state: the plane and scratch of the part are changed.
     """
     plane = state.clock[CLOCK_PLANE]
-    cursors, half = state.cursors[plane], lower_half(shape)
+    cursors, half = state.cursors[plane], lower_part(shape, operator.pooling)
     first, last = (0, half) if part == 0 else (half, shape[0] * shape[1])
     for volume in range(max(first, cursors[CURSOR_CODED]), last):
         if volume >= cursors[CURSOR_PROJECTED]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, TAKE, lower_half, pool_volume, read_features
+from streamfeat.kernels.encode import ADD, TAKE, lower_part, pool_volume, read_features
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.layout import (
     CLOCK_DIRTY,
@@ -87,10 +87,11 @@ def renew(part: int, shape: tuple[int, int], operator: Operator, state: State) -
     """
     n_bins, patch, n_volumes = state.counts.shape[0], operator.patch, shape[0] * shape[1]
     values, entries, changes = state.values[part], state.entries[part], state.changes[part]
+    lower = lower_part(shape, operator.pooling)
     for i in range(state.clock[CLOCK_DIRTY]):
         index = np.int64(state.dirty[i])
         plane, volume = index // n_volumes, index % n_volumes
-        if part != np.int64(volume >= lower_half(shape)):
+        if part != np.int64(volume >= lower):
             continue
         cursors = state.cursors[plane]
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
