@@ -4,7 +4,7 @@ Lives here: normalising pooled features, training with cross-validation, saving,
 Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -12,9 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.linear_model import SGDClassifier
-from sklearn.model_selection import GridSearchCV, StratifiedKFold
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.model_selection import StratifiedGroupKFold
+from sklearn.preprocessing import StandardScaler
 
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
@@ -26,6 +25,12 @@ __all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classi
 FORMAT_VERSION = 1
 
 _KIND = "streamfeat-classifier"
+
+_POWERS = -9, 3
+"""Of ten: the smallest and the largest C that is tried."""
+
+_FIRST_POWER = -5
+"""Where the search for C starts."""
 
 
 def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -178,18 +183,24 @@ def train_classifier(
     labels: Sequence[str],
     encoder: FeatureMap,
     *,
-    candidates: Sequence[float] = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1),
+    groups: ArrayLike | None = None,
+    candidates: Sequence[float] | None = None,
     folds: int = 3,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,
 ) -> Classifier:
     """Train a linear SVM; its regularisation is chosen by stratified cross-validation.
 
+    Normalisation and standardisation do not look at labels; they are those of all samples in every fold.
+
     Args:
-        features: `(n, F)` float32, as `Encoder.encode` gives them.
+        features: `(n, F)` float32, as `Encoder.encode` gives them; not changed.
         labels: `n` names.
         encoder: that made the features.
-        candidates: values of C to choose from; the scale is that of standardised features.
+        groups: `n` integers; samples of one group are never on two sides of a fold, as those that were made
+            from one another. Every sample is a group if not given.
+        candidates: values of C to choose from; the scale is that of standardised features. If not given,
+            powers of ten, as many as it takes for the best to have neighbours on both sides.
         folds: of the cross-validation.
         seed: of the folds.
         provenance: JSON values kept with the classifier; scores are added.
@@ -203,7 +214,9 @@ def train_classifier(
             f"{len(missing)} of {len(labels)} training samples have no label, the first is sample "
             f"{missing[0]}; label them or leave them out"
         )
-    names, counts = np.unique(np.asarray(labels), return_counts=True)
+    targets = np.asarray(labels)
+    group = np.arange(len(targets)) if groups is None else np.asarray(groups)
+    names, counts = np.unique(targets[np.unique(group, return_index=True)[1]], return_counts=True)
     if len(names) < 2:
         raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")
     if folds < 2:
@@ -213,14 +226,22 @@ def train_classifier(
             f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
             f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
         )
-    pipeline = make_pipeline(FunctionTransformer(normalise_features), StandardScaler(), LinearSVM())
-    search = GridSearchCV(
-        pipeline,
-        {"linearsvm__C": list(candidates)},
-        cv=StratifiedKFold(folds, shuffle=True, random_state=seed),
-    )
-    search.fit(features, np.asarray(labels))
-    scaler, svm = search.best_estimator_[1], search.best_estimator_[2]
+    scaler = StandardScaler(copy=False)
+    rows = scaler.fit_transform(normalise_features(features))
+    splitter = StratifiedGroupKFold(folds, shuffle=True, random_state=seed)
+    parts = list(splitter.split(rows, targets, group))
+    machines = [LinearSVM(warm_start=True) for _ in parts]
+
+    def score(c: float) -> float:
+        right = 0
+        for svm, (train, test) in zip(machines, parts, strict=True):
+            svm.set_params(C=c).fit(rows[train], targets[train])
+            right += int(np.sum(svm.predict(rows[test]) == targets[test]))
+        return right / len(targets)
+
+    scores = {c: score(c) for c in candidates} if candidates else _climb(score, len(targets))
+    best = max(scores, key=lambda c: (scores[c], -c))
+    svm = LinearSVM(C=best).fit(rows, targets)
     return Classifier(
         labels=tuple(str(name) for name in svm.classes_),
         centre=scaler.mean_.astype(np.float32),
@@ -230,14 +251,36 @@ def train_classifier(
         fingerprint=encoder.fingerprint,
         provenance={
             **(provenance or {}),
-            "C": float(search.best_params_["linearsvm__C"]),
-            "cross_validation": {
-                str(c): round(float(score), 4)
-                for c, score in zip(candidates, search.cv_results_["mean_test_score"], strict=True)
-            },
+            "C": best,
+            "cross_validation": {str(c): round(scores[c], 4) for c in sorted(scores)},
             "samples": len(labels),
         },
     )
+
+
+def _climb(score: Callable[[float], float], n: int) -> dict[float, float]:
+    """Accuracy for powers of ten as C: up from a small one until it falls, then down if the first was best.
+
+    A large C takes much longer than a small one, and no more than what is needed to see that it is too large
+    is spent on it: one that is a standard error below the best is the last, as is the second in a row that is
+    not better.
+
+    Args:
+        score: cross-validated accuracy for a value of C; called along growing, then falling ones.
+        n: samples.
+    """
+    found: dict[int, float] = {}
+    best = _FIRST_POWER
+    for power in range(_FIRST_POWER, _POWERS[1] + 1):
+        found[power] = score(10.0**power)
+        best = max(found, key=lambda p: (found[p], -p))
+        error = np.sqrt(found[best] * (1 - found[best]) / n)
+        if power - best == 2 or found[power] < found[best] - error:
+            break
+    while best == min(found) > _POWERS[0]:
+        found[best - 1] = score(10.0 ** (best - 1))
+        best = max(found, key=lambda p: (found[p], -p))
+    return {10.0**power: value for power, value in found.items()}
 
 
 class OnlineClassifier:

@@ -1,13 +1,14 @@
 """Features of many samples at once, for training and evaluation.
 
-Lives here: `EventFeatures`, the scikit-learn transformer, and encoding samples on all cores.
+Lives here: `EventFeatures`, the scikit-learn transformer; encoding samples on all cores; mirrored samples.
 Not here: streams (`engine`), and what one window's features are (`window`).
 """
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Self
 
@@ -17,9 +18,17 @@ from sklearn.base import BaseEstimator, TransformerMixin
 
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
-from streamfeat.recording import Label, Sample
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Recording, Sample
 
-__all__ = ["EventFeatures", "encode_samples", "sample_end"]
+__all__ = [
+    "EncodedSamples",
+    "EventFeatures",
+    "encode_recordings",
+    "encode_samples",
+    "mirrored",
+    "sample_end",
+    "training_set",
+]
 
 
 def sample_end(label: Label) -> int:
@@ -54,6 +63,83 @@ def encode_samples(
         while ahead:
             yield ahead.popleft().result()
             ahead.extend(pool.submit(encode, sample) for sample in islice(source, 1))
+
+
+def mirrored(sample: Sample) -> Sample:
+    """The sample as it would look in a mirror: columns from right to left.
+
+    An event outside the sensor stays outside: `x` is unsigned and wraps.
+    """
+    events = sample.events.copy()
+    events["x"] = np.uint16(sample.resolution[1] - 1) - events["x"]
+    return replace(sample, events=events)
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedSamples:
+    """Features of labelled samples in the order of the stream.
+
+    Attributes:
+        rows: `(n, F)` float32.
+        labels: `(n,)` names.
+        held_out: `(n,)` bool, whether a sample is of a held-out split.
+    """
+
+    rows: NDArray[np.float32]
+    labels: NDArray[np.str_]
+    held_out: NDArray[np.bool_]
+
+
+def encode_recordings(
+    encoder: FeatureMap,
+    recordings: Sequence[Recording],
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
+    *,
+    mirror: bool = False,
+) -> EncodedSamples:
+    """Encode all labelled samples of recordings, or the mirror images of those that are not held out.
+
+    Args:
+        encoder: the frozen encoder.
+        recordings: open recordings.
+        report: called with (step, done, of how many, remark).
+        mirror: encode mirror images, of training samples only.
+    """
+    labels = [label for recording in recordings for label in recording.labels]
+    if mirror:
+        labels = [label for label in labels if label.split not in HELD_OUT_SPLITS]
+    rows = np.empty((len(labels), encoder.n_features), np.float32)
+    done = 0
+    for recording in recordings:
+        samples = recording.samples()
+        if mirror:
+            samples = (mirrored(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
+        for _, row in encode_samples(encoder, samples):
+            rows[done] = row
+            done += 1
+            report("encoding mirrored" if mirror else "encoding", done, len(labels), recording.path.name)
+    return EncodedSamples(
+        rows,
+        np.array([label.label for label in labels], str),
+        np.array([label.split in HELD_OUT_SPLITS for label in labels], bool),
+    )
+
+
+def training_set(
+    samples: EncodedSamples, images: EncodedSamples | None
+) -> tuple[NDArray[np.float32], list[str], NDArray[np.int64]]:
+    """What a classifier is trained on: rows, labels, and the number of the sample that each is made of.
+
+    Args:
+        samples: of which those that are not held out are taken.
+        images: mirror images of just those, if they are to be learned from as well.
+    """
+    seen = ~samples.held_out
+    rows, labels = samples.rows[seen], samples.labels[seen].tolist()
+    numbers = np.arange(len(rows))
+    if images is None:
+        return rows, labels, numbers
+    return np.concatenate([rows, images.rows]), 2 * labels, np.tile(numbers, 2)
 
 
 class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]

@@ -35,6 +35,7 @@ class LinearSVM(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         C: inverse strength of the regularisation.
         max_iter: steps of L-BFGS.
         tol: largest component of the gradient at which it stops, relative to `C` times the samples.
+        warm_start: start from the solution of the fit before, if it is of the same shape.
 
     Attributes:
         classes_: `(C,)` labels, sorted.
@@ -43,11 +44,17 @@ class LinearSVM(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         n_iter_: steps taken.
     """
 
-    def __init__(self, C: float = 1.0, max_iter: int = 500, tol: float = 1e-5) -> None:
+    coef_: NDArray[np.float64]
+    intercept_: NDArray[np.float64]
+
+    def __init__(
+        self, C: float = 1.0, max_iter: int = 500, tol: float = 1e-5, warm_start: bool = False
+    ) -> None:
         """Keep the parameters."""
         self.C = C
         self.max_iter = max_iter
         self.tol = tol
+        self.warm_start = warm_start
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit to `(n, F)` features and `(n,)` labels of at least two classes."""
@@ -74,10 +81,12 @@ class LinearSVM(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             return value, gradient.ravel()
 
         options = {"maxiter": self.max_iter, "gtol": self.tol, "maxcor": 20}
-        start = np.zeros((n_features + 1) * n_problems)
+        start = np.zeros((n_features + 1, n_problems))
+        if self.warm_start and hasattr(self, "coef_") and self.coef_.shape == (n_problems, n_features):
+            start[:-1], start[-1] = self.coef_.T, self.intercept_
         threads = 1 if features.size * n_problems < _WORTH_THREADS else None
         with threadpool_limits(threads, user_api="blas"):
-            found = minimize(objective, start, jac=True, method="L-BFGS-B", options=options)
+            found = minimize(objective, start.ravel(), jac=True, method="L-BFGS-B", options=options)
         both = found.x.reshape(n_features + 1, n_problems)
         self.coef_, self.intercept_ = both[:-1].T.copy(), both[-1].copy()
         self.n_iter_ = int(found.nit)

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import random
 
 import numpy as np
@@ -14,7 +15,13 @@ from sklearn.svm import LinearSVC
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from streamfeat import svm as svm_module
-from streamfeat.classifier import Classifier, OnlineClassifier, normalise_features, train_classifier
+from streamfeat.classifier import (
+    Classifier,
+    OnlineClassifier,
+    _climb,
+    normalise_features,
+    train_classifier,
+)
 from streamfeat.errors import InputError
 from streamfeat.svm import LinearSVM
 
@@ -250,6 +257,66 @@ def test_train_classifier(tmp_path, n_classes):
     assert clf.provenance["samples"] == 60
     clf.save(tmp_path / "clf")
     assert np.allclose(Classifier.load(tmp_path / "clf").scores(fresh), clf.scores(fresh), atol=1e-4)
+
+
+def test_c_is_looked_for_until_the_best_has_neighbours():
+    for best in range(-8, 3):
+        tried = []
+
+        def score(c, best=best, tried=tried):
+            tried.append(round(math.log10(c)))
+            return 0.9 - 0.01 * abs(tried[-1] - best)
+
+        found = {round(math.log10(c)): value for c, value in _climb(score, 1000).items()}
+        assert len(tried) == len(found)
+        assert max(found, key=found.get) == best
+        assert {best - 1, best + 1} <= found.keys()
+        # Upwards one after the other, so that each starts from the solution before.
+        up = [power for power in tried if power >= -5]
+        assert up == list(range(-5, max(up) + 1))
+
+
+def test_a_hopeless_c_is_the_last():
+    tried = []
+
+    def score(c):
+        tried.append(c)
+        return 0.9 if c < 1e-3 else 0.5
+
+    assert set(_climb(score, 1000)) == set(tried)
+    assert max(tried) == pytest.approx(1e-3)
+
+
+def test_mirror_images_are_on_the_side_of_their_samples():
+    # Samples are noise, but each has a twin: whoever has seen the twin knows the label.
+    rng = np.random.default_rng(0)
+    rows = np.tile(rng.gamma(1.0, 1.0, (60, 400)).astype(np.float32), (2, 1))
+    labels = [f"class {i % 2}" for i in range(60)] * 2
+    model = tiny.encoder(k=50)
+
+    def accuracy(groups):
+        trained = train_classifier(rows, labels, model, groups=groups, candidates=(1e-2,))
+        return max(trained.provenance["cross_validation"].values())
+
+    assert accuracy(None) > 0.8
+    assert accuracy(np.tile(np.arange(60), 2)) < 0.65
+
+
+def test_a_group_counts_once_for_folds():
+    features, _ = toy_features(8, 2)
+    labels, groups = ["cat", "cat", "owl", "owl"] * 2, [0, 1, 2, 3] * 2
+    with pytest.raises(InputError, match="'cat' has 2 training samples, 3-fold"):
+        train_classifier(features, labels, MODEL, groups=groups)
+
+
+def test_svm_warm_start():
+    x, y = blobs(3)
+    cold = LinearSVM(C=0.3).fit(x, y)
+    warm = LinearSVM(C=0.1, warm_start=True).fit(x, y).set_params(C=0.3).fit(x, y)
+    assert np.allclose(warm.coef_, cold.coef_, atol=1e-2)
+    again = warm.n_iter_, warm.fit(x, y).n_iter_
+    assert again[1] <= 2 < again[0]
+    assert warm.fit(x[:, :4], y).coef_.shape == (3, 4)  # of another shape: from zero
 
 
 def test_train_refusals():

@@ -147,6 +147,26 @@ def test_learning_goes_on_from_a_model(run, home, tmp_path):
     assert Encoder.load(model).fingerprint == Encoder.load(whole).fingerprint
 
 
+def test_options_override_the_preset(run, home, tmp_path):
+    learn = ["learn", home / "train.mcap", "-o", tmp_path / "model", *LEARN, "--preset", "paper"]
+    assert run(*learn, "--coherence", "0.3", "--iterations", "1").status == 0
+    model = Encoder.load(tmp_path / "model")
+    assert (model.encoding, model.geometry.downsample, model.geometry.max_count) == ("triangle", 2, 127)
+    assert (model.n_filters, model.geometry.patch, model.geometry.n_bins) == (6, 6, 2)
+    assert model.provenance["weights"]["coherence"] == 0.3
+
+
+def test_training_on_mirror_images_is_said_in_the_classifier(run, home, tmp_path):
+    train = ["train", home / "train.mcap", "-m", home / "direct"]
+    plain = run(*train, "-o", tmp_path / "plain", "--json").json
+    both = run(*train, "-o", tmp_path / "both", "--mirror", "--json").json
+    assert both["samples"] == plain["samples"]
+    plain, both = (Classifier.load(tmp_path / name) for name in ("plain", "both"))
+    assert (plain.provenance["mirror"], both.provenance["mirror"]) == (False, True)
+    assert both.provenance["samples"] == 2 * plain.provenance["samples"]
+    assert not np.array_equal(plain.weights, both.weights)
+
+
 def test_the_other_log_determinant_is_remarked_upon(run, home, tmp_path):
     learn = ["learn", home / "train.mcap", "-o", tmp_path / "model", *LEARN, "--overwrite"]
     assert "that of A XX' A': 6 filters are fewer than 72 entries" in run(*learn).out
@@ -404,6 +424,15 @@ REFUSALS = {
     "too few volumes for d": (
         [*NEW, "--volumes", "72"],
         "a covariance of 72 entries; learn from at least 73",
+    ),
+    "constant volumes": (
+        [*NEW, "--patch", "1", "--bins", "1", "--filters", "1"],
+        "are constant; there is no covariance to learn",
+    ),
+    "preset": ([*NEW, "--preset", "fast"], "there is no preset 'fast'; choose from default, paper"),
+    "weight of the other formulation": (
+        [*NEW, "--formulation", "inverse", "--log-det", "0.1"],
+        "log_det is a weight of the direct formulation",
     ),
     "resume nothing": ([*NEW, "--resume", "{bad}/missing"], "no such file"),
     "resume with another K": ([*NEW, "--resume", "{home}/direct", "--filters", "7"], "filters 6, not 7"),

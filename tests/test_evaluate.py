@@ -20,17 +20,19 @@ from typer.testing import CliRunner
 from streamfeat import cli
 from streamfeat.classifier import Classifier, OnlineClassifier, train_classifier
 from streamfeat.errors import InputError
+from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
-from streamfeat.evaluate.methods import random_filters, spherical_means
+from streamfeat.evaluate.methods import make_features, random_filters, spherical_means
 from streamfeat.evaluate.page import tiled
-from streamfeat.evaluate.plan import METHODS, Cell, Setting, parse_sweep, plan_cells
-from streamfeat.evaluate.run import StateFile, state_path
-from streamfeat.evaluate.splits import DataSet
+from streamfeat.evaluate.plan import METHODS, Cell, Trial, parse_sweep, plan_cells
+from streamfeat.evaluate.run import StateFile, evaluate, state_path
+from streamfeat.evaluate.splits import DataSet, Fold
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
 from streamfeat.learn.chunks import LazyVolumes
+from streamfeat.learn.volumes import windows_of
 from streamfeat.machine import PeakMemory
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Sample, open_recording
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
 
 QUICK = ["--patch", "4", "--bins", "2", "--filters", "12", "--volumes", "600", "--iterations", "2"]
 BASELINES = [
@@ -87,7 +89,7 @@ def refused(*arguments):
 
 def test_a_held_out_split_is_the_one_fold(digits):
     data = DataSet([digits], None, 5, 0)
-    assert (data.held_out_split, data.n_folds) == (True, 1)
+    assert (data.scored, data.n_folds) == ("the recording's held-out split", 1)
     with data.open(0) as (recording,):
         assert [label.split for label in recording.labels] == ["test"] * 12 + ["train"] * 68
 
@@ -121,7 +123,7 @@ def test_nothing_is_learned_from_what_is_held_out(tmp_path):
         ([tiny.packet(tiny.steady(0, 9, 5))], 5, "has no labelled samples"),
         (tiny.labelled_items(6, names=("cat",)), 5, "all samples are labelled 'cat'"),
         (tiny.labelled_items(6, names=("cat", "")), 2, "3 of 6 samples have no label, the first is sample 1"),
-        (tiny.labelled_items(6), 0, "--folds 0 leaves nothing to score"),
+        (tiny.labelled_items(6), 0, "--folds 0 leaves nothing"),
         (tiny.labelled_items(6), 5, "label 'cat' has 2 samples, fewer than 5 folds"),
     ],
 )
@@ -135,38 +137,114 @@ def test_only_held_out_samples_are_refused(tmp_path):
     assert "every sample is of a held-out split" in refused(path)
 
 
+def test_on_train_what_is_held_out_is_not_there(animals, tmp_path):
+    data = DataSet([animals], None, 4, 0, "train")
+    assert (data.scored, data.n_folds) == ("4 folds of the training samples, without those held out", 4)
+    with open_recording(animals) as recording:
+        every = list(recording.samples())
+    kept = [sample for sample in every if sample.label.split == "train"]
+    assert len(kept) == len(every) - 6
+    scored = []
+    for fold in range(4):
+        with data.open(fold) as (recording,):
+            found = list(recording.samples())
+            windows = list(windows_of(recording.items(), tiny.GEOMETRY))
+            assert len(recording.labels) == len(kept)
+        for sample, original in zip(found, kept, strict=True):
+            np.testing.assert_array_equal(sample.events, original.events)
+        # A window takes in the packets up to the next label: none of a sample that is not there.
+        starts = {s.label.start_us for s in found if s.label.split == "train"}
+        assert {window.origin_us for window in windows} == starts
+        assert all(window.events["t"].max() <= window.last_us for window in windows)
+        scored += [s.label.start_us for s in found if s.label.split == "test"]
+    assert sorted(scored) == [sample.label.start_us for sample in kept]
+
+
+def test_of_a_packet_only_the_events_of_a_held_out_sample_are_left_out(tmp_path):
+    events = tiny.steady(0, 30_000, 90)
+    items = [
+        Label(0, 10_000, "cat", "train"),
+        Label(10_000, 10_000, "dog", "test"),
+        tiny.packet(events),
+        Label(20_000, 10_000, "dog", "train"),
+        tiny.packet(tiny.steady(30_000, 31_000, 5)),
+    ]
+    path = tiny.write_items(tmp_path / "one.mcap", items)
+    with Fold(path, None) as recording:
+        packets = [item for item in recording.items() if isinstance(item, Packet)]
+    t = events["t"]
+    np.testing.assert_array_equal(packets[0].events, events[(t < 10_000) | (t >= 20_000)])
+
+
 # --- what is planned
 
 
 def test_cells_are_the_base_and_one_change_at_a_time():
-    base = Setting(filters=7)
-    cells = plan_cells(["direct", "hats"], base, [parse_sweep("bins=2,4"), parse_sweep("max-count=2")], 2)
-    got = [(cell.method, cell.swept, cell.setting.bins, cell.setting.max_count, cell.fold) for cell in cells]
-    assert got == [
-        ("direct", "", 3, 1, 0),
-        ("direct", "", 3, 1, 1),
-        ("hats", "", 3, 1, 0),
-        ("hats", "", 3, 1, 1),
-        ("direct", "bins", 2, 1, 0),
-        ("direct", "bins", 2, 1, 1),
-        ("direct", "bins", 4, 1, 0),
-        ("direct", "bins", 4, 1, 1),
-        ("direct", "max_count", 3, 2, 0),
-        ("direct", "max_count", 3, 2, 1),
+    sweeps = [parse_sweep("bins=2,4"), parse_sweep("max-count=2"), parse_sweep("seed=5")]
+    cells = plan_cells(["direct", "hots"], {"filters": 7}, sweeps, 2)
+    base = {"filters": 7}
+    expected = [
+        ("direct", "", base),
+        ("hots", "", {}),
+        ("direct", "bins", base | {"bins": 2}),
+        ("direct", "bins", base | {"bins": 4}),
+        ("direct", "max_count", base | {"max_count": 2}),
+        ("direct", "seed", base | {"seed": 5}),
+        ("hots", "seed", {"seed": 5}),
     ]
-    assert {cell.setting.filters for cell in cells} == {7}
+    assert cells == [
+        Cell(method, Trial(**setting), fold, swept)
+        for method, swept, setting in expected
+        for fold in range(2)
+    ]
+
+
+def test_what_a_method_does_not_use_makes_no_other_cell():
+    base = {"iterations": 3, "log_det": 0.2, "coherence": 0.3, "patch": 5}
+    direct, inverse, kmeans, counts = plan_cells(["direct", "inverse", "kmeans", "counts"], base, [], 1)
+    assert direct.setting == Trial(**base)
+    assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
+    assert kmeans.setting == Trial(patch=5)
+    assert counts.key == {"method": "counts", "setting": {"mirror": False}, "fold": 0}
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("bins=2,4,2", [2, 4]),
+        ("encoding=soft, split", ["soft", "split"]),
+        ("threshold=0.25,.5", [0.25, 0.5]),
+        ("window-ms=50,100", [50.0, 100.0]),
+        ("log-det=0,0.1", [0.0, 0.1]),
+        ("mirror=no,yes", [False, True]),
+    ],
+)
+def test_any_value_of_a_setting_can_be_swept(text, values):
+    name, found = parse_sweep(text)
+    assert name == text.partition("=")[0].replace("-", "_")
+    assert found == values
+    cells = plan_cells(["direct"], {}, [(name, found)], 1)
+    assert [getattr(cell.setting, name) for cell in cells[1:]] == values
 
 
 @pytest.mark.parametrize(
     ("option", "what"),
     [
         (["--method", "magic"], "method 'magic' is unknown; choose from direct"),
-        (["--sweep", "depth=1,2"], "'depth' cannot be swept; choose one of filters"),
-        (["--sweep", "bins"], "give positive integers, such as --sweep bins=2,4,7"),
-        (["--sweep", "bins=2,0"], "give positive integers"),
-        (["--sweep", "bins=2,,3"], "give positive integers"),
+        (["--sweep", "depth=1,2"], "'depth' cannot be swept; choose one of encoding, filters"),
+        (["--sweep", "formulation=direct"], "'formulation' cannot be swept"),
+        (["--sweep", "bins"], "give integers, such as --sweep bins=2,4,7"),
+        (["--sweep", "bins=2,0"], "0 bins are not possible"),
+        (["--sweep", "bins=2,,3"], "give integers"),
+        (["--sweep", "threshold=low"], "give numbers, such as --sweep threshold=0.25,0.5"),
+        (["--sweep", "encoding=soft,"], "give names, such as --sweep encoding=soft,split"),
+        (["--sweep", "mirror=maybe"], "give yes and no, such as --sweep mirror=yes,no"),
+        (["--on", "test"], "--on test is unknown; choose held-out or train"),
+        (["--sweep", "encoding=loud"], "encoding is 'loud'"),
+        (["--method", "counts", "--sweep", "bins=2"], "--sweep bins: none of counts uses it"),
+        (["--preset", "fast"], "there is no preset 'fast'"),
         (["--early-samples", "-1"], "--early-samples -1"),
-        (["--seed", "-1"], "--seed -1"),
+        (["--seed", "-1"], "seed is -1"),
         (["--report", "page.pdf"], "give a name that ends in .html"),
         (["--method", "kmeans", "--volumes", "100"], "100 volumes are too few"),
     ],
@@ -257,6 +335,21 @@ def test_the_bootstrap_interval_is_that_of_resampled_samples():
         scores.bootstrap_interval(170, 200), np.percentile(means, (2.5, 97.5)), atol=0.006
     )
     assert scores.bootstrap_interval(7, 7) == (1, 1)
+
+
+def test_a_paired_interval_is_that_of_resampled_pairs():
+    rng = np.random.default_rng(0)
+    base = rng.random(300) < 0.8
+    hits = np.where(rng.random(300) < 0.1, rng.random(300) < 0.9, base)
+    drawn = rng.integers(0, 300, (4000, 300))
+    differences = (hits[drawn].astype(int) - base[drawn]).mean(axis=1)
+    digits = ["".join("01"[int(hit)] for hit in row) for row in (hits, base)]
+    expected = np.percentile(differences, (2.5, 97.5))
+    np.testing.assert_allclose(scores.paired_interval(*digits), expected, atol=0.006)
+    assert scores.paired_interval(digits[0], digits[0]) == (0, 0)
+    # Narrower than two intervals of their own: most samples are the same to both.
+    alone = scores.bootstrap_interval(int(base.sum()), 300)
+    assert expected[1] - expected[0] < 0.7 * (alone[1] - alone[0])
 
 
 def test_the_interval_of_folds_is_students():
@@ -369,8 +462,8 @@ def test_peak_memory_is_of_the_block():
 
 
 HEADER = {"format": "test", "version": 1}
-CELL = Cell("counts", Setting(), 0)
-RESULT = {"right": 3, "samples": [4, 5], "confusion": [[1]]}
+CELL = Cell("direct", Trial(), 0)
+RESULT = {"hits": "11100", "samples": [4, 5], "confusion": [[1]]}
 
 
 def test_a_cell_is_kept_and_found_again(tmp_path):
@@ -379,7 +472,7 @@ def test_a_cell_is_kept_and_found_again(tmp_path):
     again = StateFile(path, HEADER)
     assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
     assert again.get(replace(CELL, fold=1)) is None
-    assert again.get(replace(CELL, setting=Setting(bins=4))) is None
+    assert again.get(replace(CELL, setting=Trial(bins=4))) is None
 
 
 def test_a_line_that_was_being_written_is_dropped(tmp_path):
@@ -435,6 +528,35 @@ def test_an_interrupted_run_goes_on(animals, tmp_path):
     assert not state.exists()
 
 
+def test_cells_that_differ_in_training_only_share_their_features(animals, monkeypatch):
+    made = []
+
+    def make(method, recordings, setting, report):
+        made.append((method, setting))
+        return make_features(method, recordings, setting, report)
+
+    monkeypatch.setattr(cell_module, "make_features", make)
+    sweeps = [parse_sweep("mirror=no,yes"), parse_sweep("filters=6,12")]
+    base = {"patch": 4, "bins": 2, "filters": 12, "volumes": 600, "iterations": 1}
+    cells = plan_cells(["counts", "direct"], base, sweeps, 1)
+    result = evaluate(DataSet([animals], None, 5, 0), cells, early_samples=0)
+    assert [(method, setting.filters) for method, setting in made] == [
+        ("counts", 400),
+        ("direct", 12),
+        ("direct", 6),
+    ]
+    rows = {(r["method"], r["swept"], r["setting"].get(r["swept"])): r for r in result["rows"]}
+    assert len(rows) == 8
+    for method in ("counts", "direct"):
+        same, mirrored = (rows[method, "mirror", value] for value in (False, True))
+        assert same["accuracy"] == rows[method, "", None]["accuracy"]
+        assert same["difference"] == {"accuracy": 0, "low": 0, "high": 0}
+        assert mirrored["encode_s"] > same["encode_s"]
+        assert len(mirrored["hits"]) == 6
+        assert mirrored["samples"] == same["samples"]
+    assert "prequential" not in rows["direct", "mirror", True]
+
+
 # --- how it is shown
 
 
@@ -443,7 +565,7 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     output, page = tmp_path / "result.json", tmp_path / "result.html"
     every = [argument for method in METHODS for argument in ("--method", method)]
     run = invoke(
-        animals, *QUICK, *every, "--sweep", "filters=12,14", "--sweep", "patch=3",
+        animals, *QUICK, *every, "--sweep", "filters=12,14", "--sweep", "patch=3", "--sweep", "mirror=yes",
         "--early-samples", "4", "-o", output, "--report", page, "--json",
     )  # fmt: skip
     assert run.exit_code == 0, run.output
@@ -457,6 +579,12 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
         assert np.sum(row["confusion"]) == 6
         assert min(row["learn_s"], row["encode_s"], row["train_s"]) >= 0
         assert row["peak_mb"] > 50
+        if row["swept"]:
+            difference = row["difference"]
+            assert difference["low"] <= difference["accuracy"] <= difference["high"]
+            (first,) = (r for r in base if r["method"] == row["method"])
+            assert difference["accuracy"] == pytest.approx(row["accuracy"] - first["accuracy"], abs=2e-4)
+    assert {row["method"] for row in result["rows"] if row["swept"] == "mirror"} == set(METHODS)
     for row in base:
         assert row["early"]["samples"] == 4
         assert row["share_reached"]["ms"] <= 80
@@ -470,6 +598,7 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
         assert f"<h2>{title}" in html
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', html)  # nothing from elsewhere
     assert "N-Caltech101" in html
+    assert "to base" in html
 
     assert "exists already" in refused(animals, "-o", output)
 

@@ -41,7 +41,7 @@ LAYERS = [
 
 ROOMS = {
     "learn": [
-        {"chunks", "omega", "volumes"},
+        {"chunks", "omega", "setting", "volumes"},
         {"initial", "whitening"},
         {"alternation"},
         {"dictionary", "transform"},
@@ -61,7 +61,10 @@ ROOMS = {
         {"cell", "page"},
         {"run"},
     ],
-    "cli": [{"program"}, {"evaluating", "learning", "live", "measuring", "recordings", "streaming"}],
+    "cli": [
+        {"options", "program"},
+        {"evaluating", "learning", "live", "measuring", "recordings", "streaming"},
+    ],
 }
 """The same inside packages that are one place in the layers."""
 
@@ -72,6 +75,7 @@ ONLY_IN = {
     "prometheus_client": {"live.health"},
     "typer": {
         "cli.program",
+        "cli.options",
         "cli.evaluating",
         "cli.recordings",
         "cli.learning",

@@ -11,7 +11,8 @@ from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.geometry import Geometry
-from streamfeat.learn.fit import bin_length, learn_encoder
+from streamfeat.learn.fit import geometry_of, learn_encoder
+from streamfeat.learn.setting import DEFAULTS, PRESETS, THRESHOLDS, Setting, preset_with
 from streamfeat.learn.volumes import Window, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recording import Label, open_recording
@@ -190,7 +191,15 @@ def test_windows_end_where_the_resolution_changes():
 # --- all of it
 
 
-LEARN = {"n_filters": 7, "n_volumes": 200, "max_iter": 2, "seed": 4}
+LEARN = {
+    "filters": 7, "patch": 4, "bins": 2, "window_ms": 100.0, "max_count": 2,
+    "volumes": 200, "iterations": 2, "seed": 4,
+}  # fmt: skip
+"""The geometry is `tiny.GEOMETRY`."""
+
+
+def learn(recording, resume=None, report=lambda *step: None, **changes):
+    return learn_encoder([recording], Setting(**LEARN | changes), resume=resume, report=report)
 
 
 @pytest.fixture
@@ -204,16 +213,10 @@ def recording(tmp_path):
 def test_learn_encoder(recording, formulation):
     told = []
     model, again = (
-        learn_encoder(
-            [recording],
-            tiny.GEOMETRY,
-            formulation=formulation,
-            report=lambda *step: told.append(step),
-            **LEARN,
-        )
-        for _ in range(2)
+        learn(recording, formulation=formulation, report=lambda *step: told.append(step)) for _ in range(2)
     )
     assert (model.n_filters, model.formulation, model.geometry) == (7, formulation, tiny.GEOMETRY)
+    assert (model.encoding, model.threshold) == ("split", THRESHOLDS[formulation])
     assert model.fingerprint == again.fingerprint
     assert model.provenance["windows"] == 6
     assert model.provenance["volumes"] == 200
@@ -224,6 +227,21 @@ def test_learn_encoder(recording, formulation):
     assert {step[0] for step in told} == {"reading windows", "whitening", "learning"}
     share = f"{model.provenance['empty_share']:.1%} of places were empty"
     assert share in next(step[3] for step in told if step[0] == "whitening")
+
+
+@pytest.mark.parametrize(
+    ("formulation", "weights"),
+    [
+        ("direct", {"conditioning": 0.4, "coherence": 0.3, "log_det": 0.2}),
+        ("inverse", {"coherence": 0.3}),
+    ],
+)
+def test_weights_of_the_penalty_reach_the_learner(recording, formulation, weights):
+    usual = learn(recording, formulation=formulation)
+    for name, weight in weights.items():
+        model = learn(recording, formulation=formulation, **{name: weight})
+        assert model.provenance["weights"] == usual.provenance["weights"] | {name: weight}
+        assert model.fingerprint != usual.fingerprint
 
 
 def interrupt_at(iteration):
@@ -238,13 +256,13 @@ def interrupt_at(iteration):
 
 @pytest.mark.parametrize("formulation", ["direct", "inverse"])
 def test_an_interrupted_encoder_is_one_to_go_on_from(recording, tmp_path, formulation):
-    make = LEARN | {"formulation": formulation, "max_iter": 5}
-    whole = learn_encoder([recording], tiny.GEOMETRY, **make)
-    part = learn_encoder([recording], tiny.GEOMETRY, **make, report=interrupt_at(2))
+    five = {"formulation": formulation, "iterations": 5}
+    whole = learn(recording, **five)
+    part = learn(recording, **five, report=interrupt_at(2))
     assert (part.provenance["interrupted"], part.provenance["iterations"]) == (True, 2)
     part.save(tmp_path / "part")
     part = Encoder.load(tmp_path / "part")
-    rest = learn_encoder([recording], tiny.GEOMETRY, **make | {"max_iter": 3}, resume=part)
+    rest = learn(recording, resume=part, formulation=formulation, iterations=3)
     assert (rest.provenance["interrupted"], rest.provenance["iterations"]) == (False, 5)
     assert [len(rest.provenance[name]) for name in ("objective", "condition", "coherence")] == [10, 5, 5]
     if formulation == "direct":
@@ -261,35 +279,34 @@ def test_an_interruption_before_anything_was_learned_gives_no_encoder(recording)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learn_encoder([recording], tiny.GEOMETRY, **LEARN, report=report)
+        learn(recording, report=report)
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"geometry": Geometry(4, 2, 2, 50_000, 1, 2)}, r"has geometry .*stride=4.* not .*stride=2"),
+        ({"stride": 2}, r"has geometry .*stride=4.* not .*stride=2"),
         ({"formulation": "inverse"}, "has formulation direct, not inverse"),
         ({"encoding": "soft"}, "has encoding split, not soft"),
         ({"threshold": 0.7}, "has threshold 0.5, not 0.7"),
-        ({"n_filters": 8}, "has filters 7, not 8"),
-        ({"n_volumes": 100}, r"learned from other volumes \(200 of a.mcap, seed 4\)"),
+        ({"log_det": 0.7}, r"has weights .*'log_det': 0.1.* not .*'log_det': 0.7"),
+        ({"filters": 8}, "has filters 7, not 8"),
+        ({"volumes": 100}, r"learned from other volumes \(200 of a.mcap, seed 4\)"),
         ({"seed": 5}, "learned from other volumes"),
     ],
 )
 def test_going_on_from_something_else_is_refused(recording, change, reason):
-    model = learn_encoder([recording], tiny.GEOMETRY, **LEARN)
     with pytest.raises(InputError, match=reason):
-        learn_encoder([recording], **{"geometry": tiny.GEOMETRY} | LEARN | change, resume=model)
+        learn(recording, resume=learn(recording), **change)
 
 
 def test_going_on_from_other_recordings_or_a_model_without_history_is_refused(recording, tmp_path):
-    model = learn_encoder([recording], tiny.GEOMETRY, **LEARN)
+    model = learn(recording)
     other = tiny.write_items(tmp_path / "a2.mcap", tiny.labelled_items(5))
     with open_recording(other) as opened, pytest.raises(InputError, match="other volumes"):
-        learn_encoder([opened], tiny.GEOMETRY, **LEARN, resume=model)
-    bare = tiny.encoder(k=7)
+        learn(opened, resume=model)
     with pytest.raises(InputError, match="does not say how it was learned"):
-        learn_encoder([recording], tiny.GEOMETRY, **LEARN, threshold=0.3, resume=bare)
+        learn(recording, resume=tiny.encoder(k=7), threshold=0.3)
 
 
 @pytest.mark.parametrize(
@@ -297,34 +314,56 @@ def test_going_on_from_other_recordings_or_a_model_without_history_is_refused(re
     [
         ({"formulation": "sideways"}, "formulation is 'sideways'"),
         ({"encoding": "loud"}, "encoding is 'loud'"),
-        ({"n_volumes": 1}, "at least two volumes"),
-        ({"n_volumes": 32}, "32 volumes are too few .* a covariance of 32 entries; learn from at least 33"),
-        ({"n_filters": 300}, "200 volumes are too few for 300 filters .* at least 300"),
-        ({"max_iter": 0}, "one iteration"),
+        ({"volumes": 1}, "at least two volumes"),
+        ({"volumes": 32}, "32 volumes are too few .* a covariance of 32 entries; learn from at least 33"),
+        ({"filters": 300}, "200 volumes are too few for 300 filters .* at least 300"),
+        ({"iterations": 0}, "one iteration"),
         ({"seed": -1}, "seed"),
         ({"seed": 2**40}, "seed"),
         ({"threshold": float("nan")}, "threshold"),
-        ({"n_filters": 0}, "one filter"),
+        ({"threshold": 0.0, "formulation": "inverse"}, "threshold is 0.0"),
+        ({"filters": 0}, "one filter"),
+        ({"bins": 0}, "0 bins"),
+        ({"window_ms": 0.0}, "a window of 0.0 ms"),
+        ({"window_ms": float("nan")}, "a window of nan ms"),
+        ({"coherence": -1.0}, "coherence is -1.0, it must be finite and not negative"),
+        ({"conditioning": 0.1, "formulation": "inverse"}, "conditioning is a weight of the direct"),
+        ({"log_det": 0.1, "formulation": "inverse"}, "log_det is a weight of the direct"),
     ],
 )
-def test_bad_parameters_are_refused_before_any_work(recording, change, reason):
-    with pytest.raises(InputError, match=reason):
-        learn_encoder([recording], tiny.GEOMETRY, **LEARN | change, report=interrupt_at(1))
+def test_bad_settings_are_refused_before_any_work(change, reason):
+    with pytest.raises(InputError, match=reason) as refusal:
+        Setting(**LEARN | change)
+    assert "\n" not in str(refusal.value)
+
+
+def test_presets():
+    assert Setting(**preset_with("default", {})) == Setting()
+    paper = Setting(**preset_with("paper", {"filters": 100, "bins": None}))
+    assert (paper.filters, paper.bins, paper.encoding) == (100, 7, "triangle")
+    assert all(changes.keys() <= DEFAULTS.keys() for changes in PRESETS.values())
+    with pytest.raises(InputError, match="there is no preset 'fast'; choose from default, paper"):
+        preset_with("fast", {})
 
 
 def test_a_recording_of_too_few_volumes_is_refused(tmp_path):
     path = tiny.write_items(tmp_path / "b.mcap", tiny.labelled_items(1, events=3))
     with open_recording(path) as recording, pytest.raises(InputError, match="too few volumes") as refusal:
-        learn_encoder([recording], tiny.GEOMETRY, **LEARN | {"n_volumes": 1000, "n_filters": 900})
+        learn(recording, volumes=1000, filters=900)
     assert "\n" not in str(refusal.value)
 
 
-def test_bin_length(tmp_path):
-    labelled = tiny.write_items(tmp_path / "a.mcap", tiny.labelled_items(2, duration_us=90_001))
-    with open_recording(labelled) as recording:
-        assert bin_length([recording], 3, None) == 30_001
-        assert bin_length([recording], 3, 30) == 10_000
-        assert bin_length([], 4, None) == 25_000
-        for n_bins, window_ms in ((0, None), (3, 0.0), (3, float("nan"))):
-            with pytest.raises(InputError):
-                bin_length([recording], n_bins, window_ms)
+def test_the_window_is_that_of_the_samples_to_learn_from(tmp_path):
+    items = tiny.labelled_items(3, duration_us=90_001)
+    items += [Label(5_000_000 + i, 10, "cat", "test", "") for i in range(5)]
+    with open_recording(tiny.write_items(tmp_path / "a.mcap", items)) as recording:
+        assert geometry_of(Setting(), [recording]).bin_us == 30_001
+        assert geometry_of(Setting(window_ms=30.0), [recording]).bin_us == 10_000
+    assert geometry_of(Setting(bins=4), []).bin_us == 25_000
+    assert geometry_of(Setting(**LEARN), []) == tiny.GEOMETRY
+
+
+def test_a_geometry_has_every_value_of_a_setting_that_it_knows():
+    changed = {"patch": 5, "stride": 3, "downsample": 2, "max_count": 9}
+    geometry = geometry_of(Setting(**changed), [])
+    assert {name: getattr(geometry, name) for name in changed} == changed

@@ -23,12 +23,10 @@ from sklearn.base import clone
 from sklearn.decomposition import MiniBatchDictionaryLearning
 from sklearn.exceptions import ConvergenceWarning
 
-from streamfeat.geometry import Geometry
 from streamfeat.learn.dictionary import DictionaryLearner
-from streamfeat.learn.fit import THRESHOLDS, bin_length
+from streamfeat.learn.fit import prepare
+from streamfeat.learn.setting import THRESHOLDS, Setting
 from streamfeat.learn.transform import TransformLearner
-from streamfeat.learn.volumes import sample_volumes, windows_of
-from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recording import open_recording
 
 Curve = list[tuple[float, float]]
@@ -36,11 +34,9 @@ Curve = list[tuple[float, float]]
 
 
 def volumes_of(path: Path, n: int, patch: int, bins: int) -> np.ndarray:
+    setting = Setting(patch=patch, bins=bins, volumes=n, filters=1)
     with open_recording(path) as recording:
-        geometry = Geometry(patch=patch, n_bins=bins, bin_us=bin_length([recording], bins, None))
-        windows = windows_of(recording.items(), geometry)
-        counts = sample_volumes(windows, geometry, n, np.random.default_rng(0)).counts
-    return VolumeWhitener().fit_transform(counts)
+        return prepare([recording], setting, lambda step, done, total, remark: None).white[:]
 
 
 def lasso_objective(white: np.ndarray, atoms: np.ndarray, threshold: float) -> float:

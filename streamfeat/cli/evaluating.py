@@ -15,6 +15,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from streamfeat.cli import options
 from streamfeat.cli.program import (
     JsonOption,
     OverwriteOption,
@@ -39,6 +40,7 @@ _WIDEST_CONFUSION = 12
     "--patch 8 --method direct --method hats --sweep filters=50,200 -o result.json --report result.html"
 )
 def evaluate(
+    context: typer.Context,
     recordings: RecordingsArgument,
     methods: Annotated[
         list[str],
@@ -47,24 +49,35 @@ def evaluate(
     sweeps: Annotated[
         list[str] | None,
         typer.Option(
-            "--sweep", help="Vary one option, such as filters=1000,1500 or bins=2,4,7; may be repeated."
+            "--sweep",
+            help="Vary one option, such as filters=1000,1500 or encoding=soft,split; may be repeated.",
         ),
     ] = None,
-    encoding: Annotated[str, typer.Option(help="What is pooled: soft, split or triangle.")] = "split",
-    filters: Annotated[int, typer.Option(help="Number of filters or atoms, K.")] = 400,
-    patch: Annotated[int, typer.Option(help="Pixels along a side of a local volume.")] = 12,
-    stride: Annotated[int, typer.Option(help="Pixels between neighbouring volumes.")] = 4,
-    bins: Annotated[int, typer.Option(help="Time bins in the window.")] = 3,
-    window_ms: Annotated[
-        float | None, typer.Option(help="Length of the window; the median sample if not given.")
-    ] = None,
-    downsample: Annotated[int, typer.Option(help="Sensor pixels along a side of a ring pixel.")] = 1,
-    max_count: Annotated[int, typer.Option(help="Counts are clipped to plus and minus this.")] = 1,
-    threshold: Annotated[float | None, typer.Option(help="Sparsity penalty lambda0.")] = None,
-    volumes: Annotated[int, typer.Option(help="Local volumes to learn from.")] = 50_000,
-    iterations: Annotated[int, typer.Option(help="Alternations at most.")] = 20,
-    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
-    folds: Annotated[int, typer.Option(help="Folds, where no sample is of a held-out split.")] = 5,
+    preset: options.Preset = "default",
+    encoding: options.Encoding = None,
+    filters: options.Filters = None,
+    patch: options.Patch = None,
+    stride: options.Stride = None,
+    bins: options.Bins = None,
+    window_ms: options.WindowMs = None,
+    downsample: options.Downsample = None,
+    max_count: options.MaxCount = None,
+    threshold: options.Threshold = None,
+    conditioning: options.Conditioning = None,
+    coherence: options.Coherence = None,
+    log_det: options.LogDet = None,
+    volumes: options.Volumes = None,
+    iterations: options.Iterations = None,
+    seed: options.Seed = None,
+    mirror: options.Mirror = False,
+    on: Annotated[
+        str,
+        typer.Option(
+            help="What is scored: held-out, or train, folds of the samples that are not held out; to choose "
+            "settings without a look at those that are."
+        ),
+    ] = "held-out",
+    folds: Annotated[int, typer.Option(help="Folds, where no held-out split is scored.")] = 5,
     early_samples: Annotated[
         int, typer.Option(help="Held-out samples for early decision, at most; 0 leaves it out.")
     ] = 500,
@@ -82,40 +95,25 @@ def evaluate(
     every finished run is kept beside the result: the same command goes on after an interruption.
     """
     from streamfeat.evaluate.page import check_page, write_page
-    from streamfeat.evaluate.plan import Setting, parse_sweep, plan_cells
+    from streamfeat.evaluate.plan import Trial, parse_sweep, plan_cells
     from streamfeat.evaluate.run import evaluate as run
     from streamfeat.evaluate.run import save_result, state_path
     from streamfeat.evaluate.splits import DataSet
 
     if early_samples < 0:
         raise InputError(f"--early-samples {early_samples} is not possible; give 0 or more")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"--seed {seed} is not possible; give 0 to 2^32 - 1")
     for path in (output, page):
         if path:
             refuse_existing(path, overwrite=overwrite)
     if page:
         check_page(page)
-    base = Setting(
-        filters,
-        patch,
-        stride,
-        bins,
-        window_ms,
-        downsample,
-        max_count,
-        encoding,  # type: ignore[arg-type]
-        threshold,
-        volumes,
-        iterations,
-        seed,
-    )
+    base = options.setting_given(context) | {"mirror": mirror}
     parsed = [parse_sweep(text) for text in sweeps or []]
-    plan_cells(methods, base, parsed, 1)  # refuses an unknown method before labels are read
+    plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
         with progress_bars() as report:
             report("reading labels", 0, 0, "")
-            data = DataSet(recordings, topic, folds, seed)
+            data = DataSet(recordings, topic, folds, Trial(**base).seed, on)
             report("reading labels", 1, 1, "")
             result = run(
                 data,
@@ -149,7 +147,13 @@ def _this_command() -> str:
 
 def _in_short(row: dict[str, Any]) -> str:
     what = f"{row['method']} {row['swept']} {row['setting'][row['swept']]}" if row["swept"] else row["method"]
-    return f"[dim]{escape(what)}: {row['accuracy']:.4f} ({row['low']:.4f} to {row['high']:.4f})[/]"
+    line = f"{what}: {row['accuracy']:.4f} ({row['low']:.4f} to {row['high']:.4f})"
+    if row["swept"]:
+        difference = row["difference"]
+        line += (
+            f", to base {difference['accuracy']:+.4f} ({difference['low']:+.4f} to {difference['high']:+.4f})"
+        )
+    return f"[dim]{escape(line)}[/]"
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
+from streamfeat.cli import options
 from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
@@ -31,23 +32,26 @@ __all__ = ["learn", "train"]
 
 @app.command(epilog="Example: streamfeat learn recordings/digits_train.mcap -o model.safetensors")
 def learn(
+    context: typer.Context,
     recordings: RecordingsArgument,
     model: Annotated[Path, typer.Option("--output", "-o", help="Model to write.")],
-    formulation: Annotated[str, typer.Option(help="direct or inverse.")] = "direct",
-    encoding: Annotated[str, typer.Option(help="What is pooled: soft, split or triangle.")] = "split",
-    filters: Annotated[int, typer.Option(help="Number of filters or atoms, K.")] = 400,
-    patch: Annotated[int, typer.Option(help="Pixels along a side of a local volume.")] = 12,
-    stride: Annotated[int, typer.Option(help="Pixels between neighbouring volumes.")] = 4,
-    bins: Annotated[int, typer.Option(help="Time bins in the window.")] = 3,
-    window_ms: Annotated[
-        float | None, typer.Option(help="Length of the window; the median sample if not given, else 100.")
-    ] = None,
-    downsample: Annotated[int, typer.Option(help="Sensor pixels along a side of a ring pixel.")] = 1,
-    max_count: Annotated[int, typer.Option(help="Counts are clipped to plus and minus this.")] = 1,
-    threshold: Annotated[float | None, typer.Option(help="Sparsity penalty lambda0.")] = None,
-    volumes: Annotated[int, typer.Option(help="Local volumes to learn from.")] = 50_000,
-    iterations: Annotated[int, typer.Option(help="Alternations at most.")] = 20,
-    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
+    formulation: Annotated[str | None, typer.Option(help="direct or inverse.", show_default="direct")] = None,
+    preset: options.Preset = "default",
+    encoding: options.Encoding = None,
+    filters: options.Filters = None,
+    patch: options.Patch = None,
+    stride: options.Stride = None,
+    bins: options.Bins = None,
+    window_ms: options.WindowMs = None,
+    downsample: options.Downsample = None,
+    max_count: options.MaxCount = None,
+    threshold: options.Threshold = None,
+    conditioning: options.Conditioning = None,
+    coherence: options.Coherence = None,
+    log_det: options.LogDet = None,
+    volumes: options.Volumes = None,
+    iterations: options.Iterations = None,
+    seed: options.Seed = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Go on from this model; recordings and all other options as it was learned with."),
@@ -61,36 +65,24 @@ def learn(
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
     """
     from streamfeat.encoder import Encoder
-    from streamfeat.geometry import Geometry
-    from streamfeat.learn.fit import bin_length, learn_encoder
+    from streamfeat.learn.fit import learn_encoder
+    from streamfeat.learn.setting import Setting
     from streamfeat.recording import open_recording
 
     refuse_existing(model, overwrite=overwrite or model == resume)
+    setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     try:
         with contextlib.ExitStack() as files, progress_bars() as report:
             opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
-            bin_us = bin_length(opened, bins, window_ms)
-            encoder = learn_encoder(
-                opened,
-                Geometry(patch, stride, bins, bin_us, downsample, max_count),
-                formulation=formulation,  # type: ignore[arg-type]
-                encoding=encoding,  # type: ignore[arg-type]
-                n_filters=filters,
-                threshold=threshold,
-                n_volumes=volumes,
-                max_iter=iterations,
-                seed=seed,
-                resume=before,
-                report=report,
-            )
+            encoder = learn_encoder(opened, setting, resume=before, report=report)
     except KeyboardInterrupt:
         err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
         raise typer.Exit(130) from None
     encoder.save(model)
     result = {
         "written": str(model),
-        "formulation": formulation,
+        "formulation": encoder.formulation,
         "filters": encoder.n_filters,
         "features": encoder.n_features,
         "volumes": encoder.provenance["volumes"],
@@ -103,8 +95,10 @@ def learn(
         "bytes": model.stat().st_size,
     }
     entries = encoder.geometry.entries
-    if formulation == "direct" and filters < entries:
-        result["log_determinant"] = f"that of A XX' A': {filters} filters are fewer than {entries} entries"
+    if encoder.formulation == "direct" and encoder.n_filters < entries:
+        result["log_determinant"] = (
+            f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
+        )
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
         print_losses(rec.losses)
@@ -125,49 +119,46 @@ def train(
     model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
+    mirror: options.Mirror = False,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
-    import numpy as np
-
     from streamfeat.classifier import train_classifier
     from streamfeat.encoder import Encoder
-    from streamfeat.features import encode_samples
-    from streamfeat.recording import HELD_OUT_SPLITS, open_recording
+    from streamfeat.features import encode_recordings, training_set
+    from streamfeat.recording import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
     encoder = Encoder.load(model)
-    rows: list[tuple[bool, str, Any]] = []
     with contextlib.ExitStack() as files, progress_bars() as report:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
-        total = sum(len(rec.labels) for rec in opened)
         for rec in opened:
             if not rec.labels:
                 raise InputError(f"{rec.path}: has no labelled samples; `streamfeat convert` writes labels")
-        for rec in opened:
-            for label, features in encode_samples(encoder, rec.samples()):
-                rows.append((label.split in HELD_OUT_SPLITS, label.label, features))
-                report("encoding", len(rows), total, rec.path.name)
-        report("training", 0, 0, f"{folds}-fold cross-validation")
-        seen = [row for row in rows if not row[0]]
-        if not seen:
+        samples = encode_recordings(encoder, opened, report)
+        if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
-        features = np.stack([row[2] for row in seen])
-        trained = train_classifier(features, [row[1] for row in seen], encoder, folds=folds)
+        images = encode_recordings(encoder, opened, report, mirror=True) if mirror else None
+        report("training", 0, 0, f"{folds}-fold cross-validation")
+        rows, labels, numbers = training_set(samples, images)
+        trained = train_classifier(
+            rows, labels, encoder, groups=numbers, folds=folds, provenance={"mirror": mirror}
+        )
     trained.save(classifier)
-    held_out = [row for row in rows if row[0]]
+    held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
         "labels": ", ".join(trained.labels),
-        "samples": len(seen),
+        "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
-    if held_out:
-        right = sum(trained.predict(row[2]) == row[1] for row in held_out)
-        result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(right / len(held_out), 4)}
+    if len(held_out):
+        predicted = [trained.predict(row) for row in held_out]
+        share = (samples.labels[samples.held_out] == predicted).mean()
+        result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
     print_result(result, "trained", as_json=as_json)
     for rec in opened:
         print_losses(rec.losses)

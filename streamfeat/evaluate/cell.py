@@ -5,92 +5,129 @@ Lives here: the steps for one method in one setting on one fold. Not here: the t
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from streamfeat.classifier import train_classifier
+from streamfeat.classifier import Classifier, train_classifier
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.features import encode_samples
+from streamfeat.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.machine import PeakMemory
-from streamfeat.recording import HELD_OUT_SPLITS, Recording, Sample
+from streamfeat.recording import Recording, Sample
 
-__all__ = ["run_cell"]
+__all__ = ["run_cells"]
 
 _SHOWN_FILTERS = 48
 
 
-@dataclass(slots=True)
-class _Encoded:
-    """Features of all samples in the order of the stream, and what they are."""
-
-    rows: list[NDArray[np.float32]] = field(default_factory=list)
-    labels: list[str] = field(default_factory=list)
-    held_out: list[bool] = field(default_factory=list)
-
-
-def run_cell(data: DataSet, cell: Cell, report: Report, *, early_samples: int) -> dict[str, Any]:
-    """Run one cell; the result is JSON values.
+def run_cells(
+    data: DataSet, cells: Sequence[Cell], report: Report, *, early_samples: int
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Run cells that the same features serve; results are JSON values.
 
     Early decision, prequential accuracy and filters are of the base setting and the first fold.
 
     Args:
         data: the recordings.
-        cell: what to run.
+        cells: what to run; features are made once.
         report: told about progress.
         early_samples: held-out samples for early decision; none if 0.
+
+    Yields:
+        each cell and its result as soon as it is done.
 
     Raises:
         InputError: something in the setting does not fit the data.
     """
-    with data.open(cell.fold) as recordings, PeakMemory() as memory:
-        started = time.perf_counter()
-        features = make_features(cell.method, recordings, cell.setting, report)
-        learned = time.perf_counter()
-        _compile(features, recordings)
-        compiled = time.perf_counter()
-        found = _encode(features, recordings, report)
-        encoded = time.perf_counter()
-        report("training", 0, 0, "3-fold cross-validation")
-        held_out = np.array(found.held_out)
-        rows = np.stack(found.rows)
-        labels = np.array(found.labels)
-        classifier = train_classifier(rows[~held_out], labels[~held_out].tolist(), features)
-        trained = time.perf_counter()
-        report("training", 1, 1, "")
-        predicted = predict_all(classifier, rows[held_out])
-        true = labels[held_out].tolist()
-        result: dict[str, Any] = {
-            "samples": [int(np.sum(~held_out)), len(true)],
-            "right": sum(map(str.__eq__, true, predicted)),
-            "confusion": confusion(true, predicted, data.names),
-            "features": features.n_features,
-            "C": classifier.provenance["C"],
-            "learn_s": round(learned - started, 3),
-            "encode_s": round(encoded - compiled, 3),
-            "train_s": round(trained - encoded, 3),
+    cell = cells[0]
+    with data.open(cell.fold) as recordings:
+        with PeakMemory() as making:
+            started = time.perf_counter()
+            features = make_features(cell.method, recordings, cell.setting, report)
+            learned = time.perf_counter()
+            _compile(features, recordings)
+            compiled = time.perf_counter()
+            samples = encode_recordings(features, recordings, report)
+            encoded = time.perf_counter()
+            wanted = any(cell.setting.mirror for cell in cells)
+            images = encode_recordings(features, recordings, report, mirror=True) if wanted else None
+            all_encoded = time.perf_counter()
+        for cell in cells:
+            with PeakMemory() as training:
+                result = _scored(cell, data.names, features, samples, images, report)
+                if cell.fold == 0 and not cell.swept:
+                    classifier = result["classifier"]
+                    result |= _looked_into(
+                        cell, features, classifier, samples, recordings, report, early_samples
+                    )
+            del result["classifier"]
+            result["learn_s"] = round(learned - started, 3)
+            result["encode_s"] = round((all_encoded if cell.setting.mirror else encoded) - compiled, 3)
+            result["peak_mb"] = max(making.peak_mb, training.peak_mb)
+            yield cell, result
+
+
+def _scored(
+    cell: Cell,
+    names: Sequence[str],
+    features: FeatureMap,
+    samples: EncodedSamples,
+    images: EncodedSamples | None,
+    report: Report,
+) -> dict[str, Any]:
+    """Train and score; the classifier is part of what is found."""
+    started = time.perf_counter()
+    report("training", 0, 0, "3-fold cross-validation")
+    rows, labels, numbers = training_set(samples, images if cell.setting.mirror else None)
+    classifier = train_classifier(rows, labels, features, groups=numbers)
+    trained = time.perf_counter()
+    report("training", 1, 1, "")
+    predicted = predict_all(classifier, samples.rows[samples.held_out])
+    true = samples.labels[samples.held_out].tolist()
+    return {
+        "classifier": classifier,
+        "samples": [int(np.sum(~samples.held_out)), len(true)],
+        # A digit for each held-out sample in stored order: settings are compared sample by sample.
+        "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
+        "confusion": confusion(true, predicted, names),
+        "features": features.n_features,
+        "C": classifier.provenance["C"],
+        "train_s": round(trained - started, 3),
+    }
+
+
+def _looked_into(
+    cell: Cell,
+    features: FeatureMap,
+    classifier: Classifier,
+    samples: EncodedSamples,
+    recordings: Sequence[Recording],
+    report: Report,
+    early_samples: int,
+) -> dict[str, Any]:
+    """What is found out about the base setting only."""
+    report("prequential", 0, 1, "")
+    order = np.random.default_rng(cell.setting.seed).permutation(len(samples.labels))
+    labels = samples.labels.tolist()
+    result: dict[str, Any] = {
+        "prequential": {
+            "stream": prequential(features, samples.rows, labels),
+            "shuffled": prequential(features, samples.rows[order], [labels[i] for i in order]),
         }
-        if cell.fold == 0 and not cell.swept:
-            report("prequential", 0, 1, "")
-            result["prequential"] = {
-                "stream": prequential(features, rows, found.labels),
-                "shuffled": _prequential_shuffled(features, rows, found.labels, cell.setting.seed),
-            }
-            report("prequential", 1, 1, "")
-            chosen = _evenly(recordings, found.held_out, early_samples, report) if early_samples else []
-            if chosen:
-                report("early decision", 0, 1, f"{len(chosen)} samples")
-                result["early"] = {"samples": len(chosen), **early_decision(features, classifier, chosen)}
-                report("early decision", 1, 1, "")
-            if isinstance(features, Encoder):
-                result["learned"] = _learned(features)
-    result["peak_mb"] = memory.peak_mb
+    }
+    report("prequential", 1, 1, "")
+    held_out = samples.held_out.tolist()
+    chosen = _evenly(recordings, held_out, early_samples, report) if early_samples else []
+    if chosen:
+        report("early decision", 0, 1, f"{len(chosen)} samples")
+        result["early"] = {"samples": len(chosen), **early_decision(features, classifier, chosen)}
+        report("early decision", 1, 1, "")
+    if isinstance(features, Encoder):
+        result["learned"] = _learned(features)
     return result
 
 
@@ -98,25 +135,6 @@ def _compile(features: FeatureMap, recordings: Sequence[Recording]) -> None:
     """Encode one sample, so that what is timed is not the compiler."""
     sample = next(_samples(recordings))
     features.encode(sample.events, sample.resolution, origin_us=sample.label.start_us)
-
-
-def _encode(features: FeatureMap, recordings: Sequence[Recording], report: Report) -> _Encoded:
-    total = sum(len(recording.labels) for recording in recordings)
-    found = _Encoded()
-    for recording in recordings:
-        for label, row in encode_samples(features, recording.samples()):
-            found.rows.append(row)
-            found.labels.append(label.label)
-            found.held_out.append(label.split in HELD_OUT_SPLITS)
-            report("encoding", len(found.rows), total, recording.path.name)
-    return found
-
-
-def _prequential_shuffled(
-    features: FeatureMap, rows: NDArray[np.float32], labels: Sequence[str], seed: int
-) -> dict[str, Any]:
-    order = np.random.default_rng(seed).permutation(len(labels))
-    return prequential(features, rows[order], [labels[i] for i in order])
 
 
 def _evenly(

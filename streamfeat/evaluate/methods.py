@@ -4,21 +4,16 @@ Lives here: learning with either formulation, and the filters that those are com
 Not here: methods without filters (`surfaces`), and what features are good for (`cell`).
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import cast
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.encoder import Encoder, FeatureMap, Formulation
-from streamfeat.errors import InputError
-from streamfeat.evaluate.plan import Setting
+from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
-from streamfeat.geometry import Geometry
 from streamfeat.learn.chunks import LazyVolumes, chunks
-from streamfeat.learn.fit import THRESHOLDS, bin_length, learn_encoder
-from streamfeat.learn.volumes import Window, sample_volumes, windows_of
-from streamfeat.learn.whitening import VolumeWhitener
+from streamfeat.learn.fit import learn_encoder, prepare
+from streamfeat.learn.setting import Setting
 from streamfeat.recording import Recording
 
 __all__ = ["make_features", "random_filters", "spherical_means"]
@@ -37,11 +32,11 @@ def make_features(
     Args:
         method: one of `plan.METHODS`.
         recordings: open recordings.
-        setting: used by methods with filters.
+        setting: of that method, as in `plan.Cell`.
         report: told about progress.
 
     Raises:
-        InputError: a value of the setting is out of range, or there is too little to learn from.
+        InputError: there is too little to learn from.
         KeyboardInterrupt: Ctrl-C, at any time.
     """
     if method == "counts":
@@ -50,65 +45,21 @@ def make_features(
         return AveragedSurfaces.fitted(recordings)
     if method == "hots":
         return SurfaceHistogram.fitted(recordings, seed=setting.seed)
-    bin_us = bin_length(recordings, setting.bins, setting.window_ms)
-    geometry = Geometry(
-        setting.patch, setting.stride, setting.bins, bin_us, setting.downsample, setting.max_count
-    )
     if method in ("kmeans", "random"):
-        return _encoder_of(method, recordings, geometry, setting, report)
-    encoder = learn_encoder(
-        recordings,
-        geometry,
-        formulation=cast(Formulation, method),
-        encoding=setting.encoding,
-        n_filters=setting.filters,
-        threshold=setting.threshold,
-        n_volumes=setting.volumes,
-        max_iter=setting.iterations,
-        seed=setting.seed,
-        report=report,
-    )
+        return _other_filters(method, recordings, setting, report)
+    encoder = learn_encoder(recordings, setting, report=report)
     if encoder.provenance["interrupted"]:  # an encoder of fewer iterations is not what was asked for
         raise KeyboardInterrupt
     return encoder
 
 
-def _encoder_of(
-    method: str, recordings: Sequence[Recording], geometry: Geometry, setting: Setting, report: Report
-) -> Encoder:
+def _other_filters(method: str, recordings: Sequence[Recording], setting: Setting, report: Report) -> Encoder:
     """The pipeline of the direct formulation, with filters that solve another problem, or none."""
-    if setting.volumes <= max(setting.filters, geometry.entries):
-        raise InputError(
-            f"{setting.volumes} volumes are too few for {setting.filters} filters and a covariance of "
-            f"{geometry.entries} entries; give more than {max(setting.filters, geometry.entries)}"
-        )
-
-    def windows() -> Iterator[Window]:
-        seen = 0
-        for recording in recordings:
-            for window in windows_of(recording.items(), geometry):
-                seen += 1
-                report("reading windows", seen, 0, recording.path.name)
-                yield window
-
-    rng = np.random.default_rng(setting.seed)
-    volumes = sample_volumes(windows(), geometry, setting.volumes, rng)
-    whitener = VolumeWhitener().fit(volumes.counts)
+    material = prepare(recordings, setting, report)
+    rng = np.random.default_rng([setting.seed, 1])  # volumes were drawn from the seed alone
     if method == "random":
-        filters = random_filters(setting.filters, geometry.entries, rng)
-    else:
-        white = LazyVolumes(volumes.counts, whitener.transform)
-        filters = spherical_means(white, setting.filters, rng, report=report)
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding=setting.encoding,
-        threshold=THRESHOLDS["direct"] if setting.threshold is None else setting.threshold,
-        filters=filters,
-        whitening=whitener.whitening_,
-        mean=whitener.mean_,
-        eps=whitener.eps,
-    )
+        return material.encoder(random_filters(setting.filters, material.geometry.entries, rng))
+    return material.encoder(spherical_means(material.white, setting.filters, rng, report=report))
 
 
 def random_filters(n: int, entries: int, rng: np.random.Generator) -> NDArray[np.float32]:

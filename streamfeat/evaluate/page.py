@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 from streamfeat.errors import InputError
 from streamfeat.evaluate.words import (
     COLUMNS,
+    all_numbers,
     base_rows,
     cells,
     early_table,
+    in_order,
     notes,
     online_table,
     sweep_tables,
+    value_text,
 )
 from streamfeat.report import Section, Table, require, write_report
 
@@ -91,7 +94,9 @@ def _with_legend(plot: "figure") -> "figure":
     return plot
 
 
-def _line(plot: "figure", xs: Sequence[float], ys: Sequence[float], name: str, i: int, **style: Any) -> None:
+def _line(
+    plot: "figure", xs: Sequence[float | str], ys: Sequence[float], name: str, i: int, **style: Any
+) -> None:
     colour = _COLOURS[i % len(_COLOURS)]
     plot.line(xs, ys, color=colour, line_width=2, legend_label=name, **style)
     plot.scatter(xs, ys, color=colour, size=5, legend_label=name)
@@ -101,18 +106,21 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
     for name, (header, lines) in sweep_tables(result):
         title = "number of filters K" if name == "filters" else name.replace("_", " ")
         yield Table(header, lines, [True] * len(header))
-        plot = _plot({"patch": "patch, pixels"}.get(name, title), "accuracy")
         rows = [row for row in result["rows"] if row["swept"] == name]
+        values = in_order(row["setting"][name] for row in rows)
+        numbers = all_numbers(values)
+        axis: dict[str, Any] = {} if numbers else {"x_range": [value_text(value) for value in values]}
+        plot = _plot({"patch": "patch, pixels"}.get(name, title), "accuracy", **axis)
         methods = list(dict.fromkeys(row["method"] for row in rows))
         for i, method in enumerate(methods):
-            points = sorted(
-                (row["setting"][name], row["accuracy"], row["low"], row["high"])
-                for row in rows
-                if row["method"] == method
+            mine = {row["setting"][name]: row for row in rows if row["method"] == method}
+            shown = [value for value in values if value in mine]
+            places = shown if numbers else [value_text(value) for value in shown]
+            accuracies, lows, highs = (
+                [mine[value][figure] for value in shown] for figure in ("accuracy", "low", "high")
             )
-            values, accuracies, lows, highs = zip(*points, strict=True)
-            _line(plot, values, accuracies, method, i)
-            plot.segment(values, lows, values, highs, color=_COLOURS[i % len(_COLOURS)], legend_label=method)
+            _line(plot, places, accuracies, method, i)
+            plot.segment(places, lows, places, highs, color=_COLOURS[i % len(_COLOURS)], legend_label=method)
         paper = result["published"]["sweeps"].get(name, {})
         for i, method in enumerate(("direct", "inverse") if paper else ()):
             label = f"paper's {method}, {result['published']['data']}"

@@ -1,17 +1,17 @@
 """What is to be evaluated: methods, settings, and the cells of the table that follow.
 
-Lives here: `Setting`, `Cell`, and sweeps as they are asked for.
-Not here: what is done in a cell.
+Lives here: `Cell` and its `Trial`, what of a setting each method uses, and sweeps as they are asked for.
+Not here: what can be set (`learn.setting`), what is done in a cell (`cell`).
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from streamfeat.encoder import Encoding
 from streamfeat.errors import InputError
+from streamfeat.learn.setting import Setting
 
-__all__ = ["FILTER_METHODS", "METHODS", "SWEPT", "Cell", "Setting", "parse_sweep", "plan_cells"]
+__all__ = ["METHODS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
 
 METHODS = {
     "direct": "learned transform (direct formulation)",
@@ -24,82 +24,131 @@ METHODS = {
 }
 """Every method, and what it is."""
 
-FILTER_METHODS = ("direct", "inverse", "kmeans", "random")
-"""Those with filters over local volumes: settings and sweeps apply to them."""
-
-SWEPT = ("filters", "patch", "stride", "bins", "max_count", "downsample", "volumes")
-"""What can be swept."""
+_LEARNING = {"iterations", "conditioning", "coherence", "log_det"}
+_NOT_USED = {"inverse": {"conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
+_USED_WITHOUT_FILTERS = {"hats": ("mirror",), "hots": ("seed", "mirror"), "counts": ("mirror",)}
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """What `streamfeat learn` can be told of geometry and learning, with its defaults."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial(Setting):
+    """What a run can be told: all that `learn` can, and how the classifier is trained.
 
-    filters: int = 400
-    patch: int = 12
-    stride: int = 4
-    bins: int = 3
-    window_ms: float | None = None
-    downsample: int = 1
-    max_count: int = 1
-    encoding: Encoding = "split"
-    threshold: float | None = None
-    volumes: int = 50_000
-    iterations: int = 20
-    seed: int = 0
+    Attributes:
+        mirror: train on mirror images of the training samples as well.
+    """
+
+    mirror: bool = False
+
+
+_DEFAULTS = {field.name: field.default for field in fields(Trial)}
+
+SWEPT = tuple(name for name in _DEFAULTS if name != "formulation")
+"""What can be swept; the formulation is a method."""
+
+
+def used_by(method: str) -> tuple[str, ...]:
+    """Names of the values of a setting that mean something to a method."""
+    if method in _USED_WITHOUT_FILTERS:
+        return _USED_WITHOUT_FILTERS[method]
+    return tuple(name for name in SWEPT if name not in _NOT_USED.get(method, ()))
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One run: a method in a setting on a fold; `swept` names what differs from the base, if anything."""
+    """One run: a method in a setting on a fold; `swept` names what differs from the base, if anything.
+
+    What the method does not use has its default in the setting, so that equal runs are equal cells.
+    """
 
     method: str
-    setting: Setting
+    setting: Trial
     fold: int
     swept: str = ""
 
     @property
+    def used(self) -> dict[str, Any]:
+        """The values that mean something to the method, for JSON."""
+        return {name: getattr(self.setting, name) for name in used_by(self.method)}
+
+    @property
     def key(self) -> dict[str, Any]:
         """JSON values that tell one cell from another."""
-        return {"method": self.method, "setting": asdict(self.setting), "fold": self.fold}
+        return {"method": self.method, "setting": self.used, "fold": self.fold}
+
+    def has_features_of(self, other: "Cell") -> bool:
+        """Whether the same features serve both, so that they need not be made twice."""
+        mine, others = (replace(cell.setting, mirror=False) for cell in (self, other))
+        return (self.method, self.fold, mine) == (other.method, other.fold, others)
 
 
-def parse_sweep(text: str) -> tuple[str, list[int]]:
-    """Name and values of a sweep such as `filters=1000,1500`.
+def parse_sweep(text: str) -> tuple[str, list[Any]]:
+    """Name and values of a sweep such as `filters=1000,1500` or `encoding=soft,split`.
 
     Raises:
-        InputError: the name is unknown, or a value is no positive integer.
+        InputError: the name is unknown, or a value is not of its kind.
     """
     name, _, values = text.partition("=")
     name = name.strip().replace("-", "_")
     if name not in SWEPT:
         raise InputError(f"--sweep {text}: {name!r} cannot be swept; choose one of {', '.join(SWEPT)}")
-    parts = [part.strip() for part in values.split(",")]
-    if not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
-        raise InputError(f"--sweep {text}: give positive integers, such as --sweep {name}=2,4,7")
-    return name, list(dict.fromkeys(int(part) for part in parts))
+    parse, such_as = _KINDS[type(_DEFAULTS[name])]
+    try:
+        return name, list(dict.fromkeys(parse(part.strip()) for part in values.split(",")))
+    except (ValueError, KeyError):
+        raise InputError(f"--sweep {text}: give {such_as.format(name=name)}") from None
+
+
+def _name(text: str) -> str:
+    if not text:
+        raise ValueError
+    return text
+
+
+def _truth(text: str) -> bool:
+    return {"yes": True, "no": False}[text]
+
+
+_KINDS: dict[type, tuple[Any, str]] = {
+    int: (int, "integers, such as --sweep {name}=2,4,7"),
+    str: (_name, "names, such as --sweep {name}=soft,split"),
+    bool: (_truth, "yes and no, such as --sweep {name}=yes,no"),
+    type(None): (float, "numbers, such as --sweep {name}=0.25,0.5"),
+}
+"""By the type of the default: how a value is read, and what to give; None stands in for a number."""
 
 
 def plan_cells(
-    methods: Sequence[str], base: Setting, sweeps: Sequence[tuple[str, list[int]]], n_folds: int
+    methods: Sequence[str], base: Mapping[str, Any], sweeps: Sequence[tuple[str, list[Any]]], n_folds: int
 ) -> list[Cell]:
     """All cells: each method in the base setting, then each value of each sweep, all else as in the base.
 
+    Args:
+        methods: names of `METHODS`.
+        base: arguments of `Trial`.
+        sweeps: as from `parse_sweep`; for methods that use the name.
+        n_folds: of the data.
+
     Raises:
-        InputError: a method is unknown.
+        InputError: a method is unknown, a value is out of range, or nothing uses what is swept.
     """
     for method in methods:
         if method not in METHODS:
             raise InputError(f"method {method!r} is unknown; choose from {', '.join(METHODS)}")
-    chosen = dict.fromkeys(methods)
-    cells = [Cell(method, base, fold) for method in chosen for fold in range(n_folds)]
+    chosen = list(dict.fromkeys(methods))
+    cells = [Cell(method, _setting(method, base), fold) for method in chosen for fold in range(n_folds)]
     for name, values in sweeps:
-        for value in values:
-            setting = replace(base, **{name: value})  # type: ignore[arg-type]
-            cells += [
-                Cell(method, setting, fold, name)
-                for method in chosen
-                if method in FILTER_METHODS
-                for fold in range(n_folds)
-            ]
+        users = [method for method in chosen if name in used_by(method)]
+        if not users:
+            raise InputError(f"--sweep {name}: none of {', '.join(chosen)} uses it")
+        cells += [
+            Cell(method, _setting(method, {**base, name: value}), fold, name)
+            for value in values
+            for method in users
+            for fold in range(n_folds)
+        ]
     return cells
+
+
+def _setting(method: str, base: Mapping[str, Any]) -> Trial:
+    used = {name: value for name, value in base.items() if name in used_by(method)}
+    return Trial(formulation="inverse" if method == "inverse" else "direct", **used)

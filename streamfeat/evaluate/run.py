@@ -7,25 +7,30 @@ Not here: what a cell does (`cell`), the result as text or page (`words`, `page`
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from streamfeat.errors import InputError
-from streamfeat.evaluate.cell import run_cell
+from streamfeat.evaluate.cell import run_cells
 from streamfeat.evaluate.methods import Report
-from streamfeat.evaluate.plan import FILTER_METHODS, Cell
+from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
-from streamfeat.evaluate.scores import SHARE, bootstrap_interval, fold_interval, time_to_share
+from streamfeat.evaluate.scores import (
+    SHARE,
+    bootstrap_interval,
+    fold_interval,
+    paired_interval,
+    time_to_share,
+)
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files import write_atomically
 from streamfeat.machine import describe_machine
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
-_VERSION = 1
+_VERSION = 2
 
 
 def state_path(output: Path) -> Path:
@@ -96,7 +101,7 @@ def _line(record: dict[str, Any]) -> bytes:
 def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
     try:
         record = json.loads(line)
-        if number and not (record["cell"] and record["result"].keys() >= {"right", "samples", "confusion"}):
+        if number and not (record["cell"] and record["result"].keys() >= {"hits", "samples", "confusion"}):
             raise ValueError("it is not a finished cell")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: line {number + 1} cannot be read ({error}); delete the file") from error
@@ -123,7 +128,7 @@ def evaluate(
         finished: called with each row of the result when its last fold is done.
 
     Raises:
-        InputError: see `run_cell` and `StateFile`.
+        InputError: see `run_cells` and `StateFile`.
         KeyboardInterrupt: Ctrl-C; what is finished is in `state`.
     """
     header = {
@@ -131,27 +136,35 @@ def evaluate(
         "version": _VERSION,
         "recordings": [[str(path.name), path.stat().st_size] for path in data.paths],
         "folds": data.n_folds,
+        "scored": data.scored,
         "early_samples": early_samples,
     }
     kept = StateFile(state, header)
     rows: list[dict[str, Any]] = []
     for i, cell in enumerate(cells):
         report("cells", i, len(cells), cell.method + (f", {_swept(cell)}" if cell.swept else ""))
-        if (result := kept.get(cell)) is None:
-            result = run_cell(data, cell, report, early_samples=early_samples)
-            kept.add(cell, result)
+        if kept.get(cell) is None:
+            alike: dict[str, Cell] = {}
+            for other in cells[i:]:
+                if other.has_features_of(cell) and kept.get(other) is None:
+                    alike.setdefault(_name(other.key), other)
+            for one, result in run_cells(data, [*alike.values()], report, early_samples=early_samples):
+                kept.add(one, result)
         if cell.fold == data.n_folds - 1:
             rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)]))
+            if cell.swept:
+                base = [kept.get(c) or {} for c in cells if c.method == cell.method and not c.swept]
+                rows[-1]["difference"] = _difference(rows[-1]["hits"], "".join(f["hits"] for f in base))
             finished(rows[-1])
     report("cells", len(cells), len(cells), "")
     return {
         "recordings": [path.name for path in data.paths],
         "labels": data.names,
         "samples": {"training": rows[0]["samples"][0], "held_out": rows[0]["samples"][1]},
-        "split": "the recording's held-out split" if data.held_out_split else f"{data.n_folds} folds",
+        "split": data.scored,
         "interval": (
             "95 % bootstrap interval over held-out samples"
-            if data.held_out_split
+            if data.n_folds == 1
             else f"95 % interval of the mean over {data.n_folds} stratified folds (Student's t)"
         ),
         "rows": rows,
@@ -166,8 +179,15 @@ def save_result(path: Path, result: dict[str, Any]) -> None:
     state_path(path).unlink(missing_ok=True)
 
 
+def _difference(hits: str, base: str) -> dict[str, float]:
+    """Of a swept setting to the base setting, on the same samples."""
+    low, high = paired_interval(hits, base)
+    difference = (hits.count("1") - base.count("1")) / len(hits)
+    return {name: round(v, 4) for name, v in (("accuracy", difference), ("low", low), ("high", high))}
+
+
 def _swept(cell: Cell) -> str:
-    return f"{cell.swept} {asdict(cell.setting)[cell.swept]}"
+    return f"{cell.swept} {cell.used[cell.swept]}"
 
 
 def _folds_of(cell: Cell, cells: Sequence[Cell]) -> list[Cell]:
@@ -177,18 +197,19 @@ def _folds_of(cell: Cell, cells: Sequence[Cell]) -> list[Cell]:
 
 def _row(cell: Cell, folds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One row of the result from the folds of one method and setting."""
-    right = [fold["right"] for fold in folds]
+    right = [fold["hits"].count("1") for fold in folds]
     scored = [fold["samples"][1] for fold in folds]
     accuracies = [r / n for r, n in zip(right, scored, strict=True)]
     low, high = fold_interval(accuracies) if len(folds) > 1 else bootstrap_interval(right[0], scored[0])
     row: dict[str, Any] = {
         "method": cell.method,
         "swept": cell.swept,
-        "setting": asdict(cell.setting) if cell.method in FILTER_METHODS else {},
+        "setting": cell.used,
         "accuracy": round(float(np.mean(accuracies)), 4),
         "low": round(max(low, 0.0), 4),
         "high": round(min(high, 1.0), 4),
         "folds": [round(a, 4) for a in accuracies],
+        "hits": "".join(fold["hits"] for fold in folds),
         "samples": folds[0]["samples"],
         "features": folds[0]["features"],
         "C": [fold["C"] for fold in folds],

@@ -21,52 +21,68 @@ __all__ = ["DataSet", "Fold"]
 
 
 class Fold(Recording):
-    """A recording that says of its samples which are held out, whatever it was recorded with.
+    """A recording that is told which samples are held out; those it was recorded with as such are not there.
 
     Args:
         path: the file.
         topic: as for `open_recording`.
-        held_out: positions of the labels that are.
+        held_out: positions of the labels that are, among those that are there.
     """
 
-    def __init__(self, path: Path, topic: str | None, held_out: frozenset[int]) -> None:
+    def __init__(self, path: Path, topic: str | None, held_out: frozenset[int] = frozenset()) -> None:
         """Open it."""
         self._held_out = held_out
         super().__init__(path, topic)
 
     def items(self) -> Iterator[Packet | Label]:
-        """As those of the recording, with other splits."""
+        """As those of the recording, with other splits, and without a held-out label and its events."""
         position = 0
+        left_out: Label | None = None
         for item in super().items():
             if isinstance(item, Label):
-                yield replace(item, split="test" if position in self._held_out else "train")
-                position += 1
-            else:
+                left_out = item if item.split in HELD_OUT_SPLITS else None
+                if left_out is None:
+                    yield replace(item, split="test" if position in self._held_out else "train")
+                    position += 1
+            elif left_out is None:
                 yield item
+            else:
+                t = item.events["t"] - left_out.start_us
+                outside = (t < 0) | (t >= left_out.duration_us)
+                if outside.any():
+                    yield replace(item, events=item.events[outside])
 
 
 class DataSet:
-    """Labelled recordings: with held-out samples there is one fold, without there are `folds`, stratified.
+    """Labelled recordings, and which of their samples are scored.
+
+    Those of held-out splits are; where there is none, or `on` says so, stratified folds of the others are
+    scored in turn, and held-out samples are not there.
 
     Args:
         paths: the recordings, which are one data set together.
         topic: as for `open_recording`.
-        folds: how many, where no sample is of a held-out split.
+        folds: how many, where no held-out split is scored.
         seed: of the folds.
+        on: `held-out`, or `train` for folds of the samples that are not held out.
 
     Attributes:
         labels: of all samples in stored order, of each recording.
         names: the classes, sorted.
-        held_out_split: whether the recordings say what is held out.
-        n_folds: 1 where they do.
+        scored: what is scored, in words.
+        n_folds: 1 where that is a held-out split.
 
     Raises:
         InputError: a label is missing, there are fewer than two classes, nothing to learn from or nothing to
             score.
     """
 
-    def __init__(self, paths: Sequence[Path], topic: str | None, folds: int, seed: int) -> None:
+    def __init__(
+        self, paths: Sequence[Path], topic: str | None, folds: int, seed: int, on: str = "held-out"
+    ) -> None:
         """Read the labels."""
+        if on not in ("held-out", "train"):
+            raise InputError(f"--on {on} is unknown; choose held-out or train")
         self.paths = list(paths)
         self._topic = topic
         self.labels: list[list[Label]] = []
@@ -83,19 +99,21 @@ class DataSet:
                 f"{where}: all samples are labelled {self.names[0]!r}; at least two classes are needed"
             )
         held_out = [label.split in HELD_OUT_SPLITS for label in every]
-        self.held_out_split = any(held_out)
         if all(held_out):
             raise InputError(
                 f"{where}: every sample is of a held-out split; nothing to learn from, add training samples"
             )
-        if self.held_out_split:
-            self.n_folds = 1
-            self._folds: list[list[frozenset[int]]] = []
+        self._folds: list[list[frozenset[int]]] = []
+        if any(held_out) and on == "held-out":
+            self.scored, self.n_folds = "the recording's held-out split", 1
             return
+        self.labels = [[a for a in labels if a.split not in HELD_OUT_SPLITS] for labels in self.labels]
+        every = [label for labels in self.labels for label in labels]
+        counts = Counter(label.label for label in every)
         if folds < 2:
             raise InputError(
-                f"{where}: no sample is of a held-out split ({', '.join(sorted(HELD_OUT_SPLITS))}); "
-                f"--folds {folds} leaves nothing to score, give at least 2"
+                f"{where}: no sample is of a held-out split that is to be scored "
+                f"({', '.join(sorted(HELD_OUT_SPLITS))}); --folds {folds} leaves nothing, give at least 2"
             )
         if min(counts.values()) < folds:
             rarest = min(counts, key=lambda name: counts[name])
@@ -104,6 +122,9 @@ class DataSet:
                 "add samples or give fewer --folds"
             )
         self.n_folds = folds
+        self.scored = f"{folds} folds" + (
+            " of the training samples, without those held out" if any(held_out) else ""
+        )
         targets = np.array([label.label for label in every])
         cuts = np.cumsum([0, *map(len, self.labels)])
         splitter = StratifiedKFold(folds, shuffle=True, random_state=seed)
@@ -119,7 +140,7 @@ class DataSet:
     def open(self, fold: int) -> Iterator[list[Recording]]:
         """The recordings with the splits of one fold, closed afterwards."""
         with contextlib.ExitStack() as files:
-            if self.held_out_split:
+            if not self._folds:
                 yield [files.enter_context(open_recording(path, self._topic)) for path in self.paths]
             else:
                 yield [

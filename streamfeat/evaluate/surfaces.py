@@ -55,7 +55,7 @@ class CountImage:
 
 @dataclass(frozen=True, slots=True)
 class AveragedSurfaces:
-    """HATS: histograms of averaged time surfaces (Sironi et al. 2018, "HATS", CVPR, section 4).
+    """HATS: histograms of averaged time surfaces (Sironi et al. 2018, "HATS", CVPR).
 
     Parameters are the paper's for N-CARS: cells of 10 pixels, surfaces of 7, `tau` of 10^9 us. Deviations:
     the memory reaches back to the start of the sample (their `Delta t` is 100 ms, the length of an N-CARS

@@ -3,20 +3,23 @@
 Lives here: columns, cells, notes. Not here: how they are laid out.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from streamfeat.evaluate.plan import METHODS
 
 __all__ = [
     "COLUMNS",
+    "all_numbers",
     "base_rows",
     "cells",
     "confusion_table",
     "early_table",
+    "in_order",
     "notes",
     "online_table",
     "sweep_tables",
+    "value_text",
 ]
 
 Lines = tuple[Sequence[str], list[Sequence[str]]]
@@ -46,8 +49,8 @@ def cells(row: dict[str, Any]) -> list[str]:
     setting = row["setting"]
     return [
         row["method"],
-        f"{setting['filters']:,}" if setting else "",
-        _geometry(setting) if setting else "",
+        f"{setting['filters']:,}" if "filters" in setting else "",
+        _geometry(setting) if "patch" in setting else "",
         f"{row['features']:,}",
         f"{row['accuracy']:.3f}",
         _interval(row),
@@ -74,22 +77,49 @@ def sweep_tables(result: dict[str, Any]) -> Iterator[tuple[str, Lines]]:
         methods = list(dict.fromkeys(row["method"] for row in rows))
         paper = result["published"]["sweeps"].get(name, {})
         paper = {int(value): figures for value, figures in paper.items()}
-        header = [name.replace("_", " "), *methods]
+        header = [name.replace("_", " ")]
+        for method in methods:
+            header += [method, "to base"]
         if paper:
             header += [f"paper's {method}" for method in ("direct", "inverse")]
-        values = list(dict.fromkeys(row["setting"][name] for row in rows))
         lines: list[Sequence[str]] = []
-        for value in sorted({*values, *paper}):
+        for value in in_order([*(row["setting"][name] for row in rows), *paper]):
             mine = {row["method"]: row for row in rows if row["setting"][name] == value}
-            line = [f"{value:,}"]
-            line += [
-                f"{mine[m]['accuracy']:.3f} ({_interval(mine[m])})" if m in mine else "" for m in methods
-            ]
+            line = [value_text(value)]
+            for method in methods:
+                line += _measured(mine[method]) if method in mine else ["", ""]
             if paper:
                 figures = paper.get(value, {})
                 line += [f"{figures[m]:.3f}" if m in figures else "" for m in ("direct", "inverse")]
             lines.append(line)
         yield name, (header, lines)
+
+
+def in_order(values: Iterable[Any]) -> list[Any]:
+    """Each value of a sweep once: numbers sorted, others as they come."""
+    distinct = list(dict.fromkeys(values))
+    return sorted(distinct) if all_numbers(distinct) else distinct
+
+
+def all_numbers(values: Iterable[Any]) -> bool:
+    """Whether values can be put on an axis of numbers."""
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+def value_text(value: Any) -> str:
+    """A value of a sweep."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,}" if isinstance(value, int | float) else str(value)
+
+
+def _measured(row: dict[str, Any]) -> list[str]:
+    """Accuracy, and the difference to the base setting, each with its interval."""
+    difference = row["difference"]
+    return [
+        f"{row['accuracy']:.3f} ({_interval(row)})",
+        f"{difference['accuracy']:+.3f} ({difference['low']:+.3f} to {difference['high']:+.3f})",
+    ]
 
 
 def online_table(result: dict[str, Any]) -> Lines:
@@ -133,7 +163,7 @@ def notes(result: dict[str, Any]) -> list[str]:
         "Every method's features go through the same normalisation and linear SVM. Encoding is of all "
         "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
-    setting = next((row["setting"] for row in base_rows(result) if row["setting"]), None)
+    setting = next((row["setting"] for row in base_rows(result) if "patch" in row["setting"]), None)
     if setting:
         lines.append(
             f"Geometry is patch x patch x bins/stride, in pixels; downsample {setting['downsample']}, counts "
@@ -141,10 +171,18 @@ def notes(result: dict[str, Any]) -> list[str]:
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "
             "Filters are learned without labels, from samples that are not held out."
         )
+    if any(row["setting"].get("mirror") for row in base_rows(result)):
+        lines.append("Mirror images of the training samples were trained on as well, for every method.")
     others = [row["method"] for row in base_rows(result) if row["method"] not in ("direct", "inverse")]
     if others:
         lines.append("; ".join(f"{method}: {METHODS[method]}" for method in others) + ".")
-    if any(row["swept"] for row in result["rows"]):
+    swept = {row["swept"] for row in result["rows"] if row["swept"]}
+    if swept:
+        lines.append(
+            "To base: the difference in accuracy to the base setting on the same samples, with its 95 % "
+            "interval by a bootstrap of pairs."
+        )
+    if swept & result["published"]["sweeps"].keys():
         lines.append(
             f"The paper's figures are of {result['published']['data']}, not of these recordings "
             f"({result['published']['citation']}, third table)."

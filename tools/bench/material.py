@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 import streamfeat as sf
 from streamfeat.events import Events, Resolution
-from streamfeat.learn.fit import bin_length, learn_encoder
+from streamfeat.learn import setting as learning
+from streamfeat.learn.fit import geometry_of, learn_encoder
 from streamfeat.learn.initial import random_directions
 from streamfeat.learn.volumes import sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
@@ -171,7 +172,9 @@ class Material:
         self.path = path
         self.samples: list[Sample] = []
         with sf.open_recording(path) as recording:
-            self.duration_us = bin_length([recording], 1, None) if recording.labels else 0
+            self.duration_us = (
+                geometry_of(learning.Setting(bins=1), [recording]).window_us if recording.labels else 0
+            )
             for sample in recording.samples():
                 self.samples.append(sample)
                 if len(self.samples) == most:
@@ -282,12 +285,16 @@ def encoder_of(
     with sf.open_recording(setting.material.path) as recording:
         encoder = learn_encoder(
             [recording],
-            geometry,
-            formulation=formulation,
-            encoding=encoding,
-            n_filters=n_filters,
-            n_volumes=1_500 if setting.quick else 6000,
-            max_iter=1 if setting.quick else 3,
+            learning.Setting(
+                formulation=formulation,
+                encoding=encoding,
+                filters=n_filters,
+                bins=geometry.n_bins,
+                window_ms=geometry.window_us / 1000,
+                volumes=1_500 if setting.quick else 6000,
+                iterations=1 if setting.quick else 3,
+                **{name: value for name, value in _fields(geometry).items() if name in learning.DEFAULTS},
+            ),
         )
     setting.models.mkdir(parents=True, exist_ok=True)
     encoder.save(path)

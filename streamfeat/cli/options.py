@@ -1,0 +1,103 @@
+"""Options for what learning can be told, as `learn` and `evaluate` have them.
+
+Lives here: each option once, and a setting made of those that were given.
+Not here: what they mean (`learn.setting`).
+"""
+
+from typing import Annotated, Any
+
+import typer
+
+from streamfeat.learn.setting import DEFAULTS, PRESETS, preset_with
+
+__all__ = [
+    "Bins",
+    "Coherence",
+    "Conditioning",
+    "Downsample",
+    "Encoding",
+    "Filters",
+    "Iterations",
+    "LogDet",
+    "MaxCount",
+    "Mirror",
+    "Patch",
+    "Preset",
+    "Seed",
+    "Stride",
+    "Threshold",
+    "Volumes",
+    "WindowMs",
+    "setting_given",
+]
+
+
+def _shown(name: str) -> str:
+    """What `--help` says of the value that an option has if it is not given."""
+    return str((DEFAULTS | PRESETS["default"])[name])
+
+
+Preset = Annotated[
+    str, typer.Option(help=f"Values of all options that are not given: {' or '.join(PRESETS)}.")
+]
+Encoding = Annotated[
+    str | None,
+    typer.Option(help="What is pooled: soft, split or triangle.", show_default=_shown("encoding")),
+]
+Filters = Annotated[
+    int | None, typer.Option(help="Number of filters or atoms, K.", show_default=_shown("filters"))
+]
+Patch = Annotated[
+    int | None, typer.Option(help="Pixels along a side of a local volume.", show_default=_shown("patch"))
+]
+Stride = Annotated[
+    int | None, typer.Option(help="Pixels between neighbouring volumes.", show_default=_shown("stride"))
+]
+Bins = Annotated[int | None, typer.Option(help="Time bins in the window.", show_default=_shown("bins"))]
+WindowMs = Annotated[
+    float | None,
+    typer.Option(help="Length of the window.", show_default="the median labelled sample, 100 without labels"),
+]
+Downsample = Annotated[
+    int | None,
+    typer.Option(help="Sensor pixels along a side of a ring pixel.", show_default=_shown("downsample")),
+]
+MaxCount = Annotated[
+    int | None,
+    typer.Option(help="Counts are clipped to plus and minus this.", show_default=_shown("max_count")),
+]
+Threshold = Annotated[
+    float | None,
+    typer.Option(help="Sparsity penalty lambda0.", show_default="0.5 if direct, 1 if inverse"),
+]
+Conditioning = Annotated[
+    float | None, typer.Option(help="Weight of |A|^2 / 2; direct only.", show_default="0.1")
+]
+Coherence = Annotated[
+    float | None,
+    typer.Option(help="Weight of |A'A - I|^2 / 4.", show_default="0.02 if direct, 0.1 if inverse"),
+]
+LogDet = Annotated[
+    float | None, typer.Option(help="Weight of -log|det A'A|; direct only.", show_default="0.1")
+]
+Volumes = Annotated[
+    int | None, typer.Option(help="Local volumes to learn from.", show_default=_shown("volumes"))
+]
+Iterations = Annotated[
+    int | None, typer.Option(help="Alternations at most.", show_default=_shown("iterations"))
+]
+Seed = Annotated[int | None, typer.Option(help="Of every random choice.", show_default=_shown("seed"))]
+
+Mirror = Annotated[
+    bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")
+]
+
+
+def setting_given(context: typer.Context) -> dict[str, Any]:
+    """Arguments of `Setting` that a command's options amount to; those not given are the preset's.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    given = {name: context.params[name] for name in DEFAULTS if name in context.params}
+    return preset_with(context.params["preset"], given)
