@@ -30,7 +30,7 @@ class Geometry:
     """
 
     patch: int = 12
-    stride: int = 4
+    stride: int = 2
     n_bins: int = 3
     bin_us: int = 33_334
     downsample: int = 1

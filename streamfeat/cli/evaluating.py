@@ -62,6 +62,7 @@ def evaluate(
     window_ms: options.WindowMs = None,
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
+    pooling: options.Pooling = None,
     threshold: options.Threshold = None,
     conditioning: options.Conditioning = None,
     coherence: options.Coherence = None,

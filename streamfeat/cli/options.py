@@ -22,6 +22,7 @@ __all__ = [
     "MaxCount",
     "Mirror",
     "Patch",
+    "Pooling",
     "Preset",
     "Seed",
     "Stride",
@@ -38,7 +39,7 @@ def _shown(name: str) -> str:
 
 
 Preset = Annotated[
-    str, typer.Option(help=f"Values of all options that are not given: {' or '.join(PRESETS)}.")
+    str, typer.Option(help=f"Values of all options that are not given: {', '.join(PRESETS)}.")
 ]
 Encoding = Annotated[
     str | None,
@@ -65,6 +66,12 @@ Downsample = Annotated[
 MaxCount = Annotated[
     int | None,
     typer.Option(help="Counts are clipped to plus and minus this.", show_default=_shown("max_count")),
+]
+Pooling = Annotated[
+    int | None,
+    typer.Option(
+        help="Cells along each side, in each of which codes are summed.", show_default=_shown("pooling")
+    ),
 ]
 Threshold = Annotated[
     float | None,
