@@ -14,7 +14,7 @@ PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
-    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine"},
+    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine", "conventions"},
     {
         "kernels.code",
         "kernels.decode",
