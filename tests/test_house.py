@@ -29,7 +29,7 @@ LAYERS = [
     {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
-    {"encoder", "sinks", "report"},
+    {"encoder", "sinks", "report", "table"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
     {"cameras", "pipeline"},
@@ -86,6 +86,7 @@ ONLY_IN = {
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
+    "pyarrow": {"table"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
 }
 

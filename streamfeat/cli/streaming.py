@@ -46,6 +46,10 @@ def replay(
         typer.Option(help="Write a JSON line for each emission to this file; - is stdout."),
     ] = None,
     features: Annotated[bool, typer.Option("--features", help="Include features in JSON lines.")] = False,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="Write features and predictions to this .parquet or .arrow file; extra `export`."),
+    ] = None,
     split: Annotated[str | None, typer.Option(help="Replay only samples of this split.")] = None,
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
@@ -58,7 +62,7 @@ def replay(
     """The main job on a recording: events to features to predictions, scored where there are labels."""
     from streamfeat.replay import Replay
 
-    for path in (output, json_lines):
+    for path in (output, json_lines, table):
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
     job = Replay(
@@ -77,6 +81,7 @@ def replay(
         recording_out=output,
         json_lines=sys.stdout if to_terminal else json_lines,
         with_features=features,
+        table=table,
     )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)
