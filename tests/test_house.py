@@ -34,7 +34,7 @@ LAYERS = [
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
-    {"evaluate", "latency"},
+    {"evaluate", "latency", "doctor"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -63,7 +63,7 @@ ROOMS = {
     ],
     "cli": [
         {"options", "program"},
-        {"evaluating", "learning", "live", "measuring", "recordings", "streaming"},
+        {"evaluating", "learning", "live", "measuring", "recordings", "starting", "streaming"},
     ],
 }
 """The same inside packages that are one place in the layers."""
@@ -81,13 +81,14 @@ ONLY_IN = {
         "cli.learning",
         "cli.live",
         "cli.measuring",
+        "cli.starting",
         "cli.streaming",
     },
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
     "pyarrow": {"table"},
-    "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
+    "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch", "doctor"},
 }
 
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}

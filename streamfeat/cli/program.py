@@ -115,7 +115,7 @@ def print_result(result: dict[str, Any], title: str, *, as_json: bool) -> None:
         return
     table = Table(title=title, show_header=False, title_justify="left", box=None, pad_edge=False)
     table.add_column(style="dim")
-    table.add_column()
+    table.add_column(overflow="fold")  # or a long path would lose its end in a narrow terminal
     for name, value in result.items():
         text = f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
         table.add_row(name.replace("_", " "), escape(text))

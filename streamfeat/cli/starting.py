@@ -1,0 +1,68 @@
+"""Commands for a first look: doctor.
+
+Lives here: their arguments, and how their results are shown.
+Not here: what is looked at (`doctor`).
+"""
+
+import json
+from typing import Any
+
+import typer
+from rich.markup import escape
+
+from streamfeat.cli.program import JsonOption, app, err, out, print_result, progress_bars
+
+__all__ = ["doctor"]
+
+
+@app.command(epilog="Example: streamfeat doctor --json")
+def doctor(as_json: JsonOption = False) -> None:
+    """Versions, processor, threads, a second of work, and what is missing for which extra.
+
+    The exit status is 1 where something keeps streamfeat from working as it should. Extras may be missing.
+    """
+    from streamfeat.doctor import examine
+
+    with progress_bars() as report:
+        found = examine(lambda step: report("looking", 0, 0, step))
+    if as_json:
+        typer.echo(json.dumps(found))
+    else:
+        print_result(_overview(found), "this machine", as_json=False)
+        out.print()
+        print_result(_extras(found), "extras", as_json=False)
+        for problem in found["problems"]:
+            err.print(f"[bold red]problem:[/] {escape(problem)}", soft_wrap=True)
+        if not found["problems"]:
+            out.print("\n[green]all is well[/]")
+    raise typer.Exit(1 if found["problems"] else 0)
+
+
+def _overview(found: dict[str, Any]) -> dict[str, Any]:
+    machine, speed, kernels = found["machine"], found["speed"], found["kernels"]
+    stolen = speed["taken_by_others"]
+    return {
+        "streamfeat": machine["streamfeat"],
+        "python": f"{machine['python']}, {machine['system']}",
+        "processor": f"{machine['cpu']}, {machine['cores']} cores",
+        "vectors": ", ".join(found["vectors"]) or "none",
+        "threads": f"{found['threads']['numba']}, layer {found['threads']['layer']}",
+        **{name: about["installed"] or "missing" for name, about in found["required"].items()},
+        "kernels": f"{'kept in' if kernels['cached'] else 'cannot be kept in'} {kernels['folder']}",
+        "first_use": f"{kernels['first_use_s']} s",
+        "exact": "yes: stream and offline features have the same bits" if found["exact"] else "no",
+        "feeding": f"{speed['events_per_s']:,} events a second",
+        "following": f"{speed['event_us']} us an event, {speed['filters']} filters",
+        "disturbed": "unknown"
+        if stolen is None
+        else f"{stolen:.0%} of processor time went to other machines",
+    }
+
+
+def _extras(found: dict[str, Any]) -> dict[str, str]:
+    lines = {}
+    for extra, about in found["extras"].items():
+        missing = ", ".join(about["missing"])
+        state = f"missing {missing}; pip install 'streamfeat[{extra}]'" if missing else "complete"
+        lines[extra] = f"{about['for']}: {state}"
+    return lines
