@@ -29,12 +29,12 @@ LAYERS = [
     {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
-    {"encoder", "sinks", "report", "table"},
+    {"encoder", "sinks", "report", "table", "terminal_view"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
-    {"evaluate", "latency", "doctor"},
+    {"evaluate", "latency", "demo", "doctor"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""

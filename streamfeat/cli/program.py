@@ -33,6 +33,7 @@ __all__ = [
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
+    "QuietOption",
     "RecordingArgument",
     "RecordingsArgument",
     "TopicOption",
@@ -63,6 +64,7 @@ RecordingsArgument = Annotated[
 TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 

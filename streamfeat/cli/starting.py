@@ -1,18 +1,82 @@
-"""Commands for a first look: doctor.
+"""Commands for a first look: demo, doctor.
 
 Lives here: their arguments, and how their results are shown.
-Not here: what is looked at (`doctor`).
+Not here: what they do (`demo`, `doctor`).
 """
 
 import json
-from typing import Any
+import time
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from streamfeat.cli.program import JsonOption, app, err, out, print_result, progress_bars
+from streamfeat.cli.program import (
+    JsonOption,
+    OverwriteOption,
+    QuietOption,
+    app,
+    err,
+    out,
+    print_result,
+    progress_bars,
+)
+from streamfeat.errors import InputError
 
-__all__ = ["doctor"]
+__all__ = ["demo", "doctor"]
+
+
+@app.command(epilog="Example: streamfeat demo")
+def demo(
+    folder: Annotated[Path, typer.Option(help="Where everything is written.")] = Path("streamfeat-demo"),
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate recordings of digits, learn features, train, and replay with a live picture.
+
+    Takes a minute when kernels have to be compiled first; nothing is downloaded.
+    """
+    from streamfeat.demo import FILES, Demo
+
+    if there := [name for name in FILES if (folder / name).exists()]:
+        if not overwrite:
+            raise InputError(
+                f"{folder}: holds {', '.join(there)} already; give --overwrite, or another --folder"
+            )
+        err.print(f"[yellow]replacing[/] {', '.join(there)} in {escape(str(folder))}", soft_wrap=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}; give another --folder") from error
+    started = time.monotonic()
+    try:
+        with progress_bars() as report:
+            job = Demo(folder, report)
+            simulated = job.simulate()
+            encoder = job.learn()
+            classifier = job.fit(encoder)
+        replayed = job.replay(encoder, classifier, None if quiet or as_json else out)
+    except KeyboardInterrupt:
+        err.print(f"[yellow]interrupted[/]; {escape(str(folder))} holds what was done", soft_wrap=True)
+        raise typer.Exit(130) from None
+    result = {
+        "written": str(folder),
+        "simulated": simulated,
+        "features": encoder.n_features,
+        **replayed,
+        "seconds": round(time.monotonic() - started, 1),
+    }
+    if as_json:
+        typer.echo(json.dumps(result | {"next": job.commands()}))
+    else:
+        print_result(result, "demonstrated", as_json=False)
+        out.print("\n[bold]try next[/]")
+        for command in job.commands():
+            typer.echo(command)  # as it is, for it is to be copied
+    if job.interrupted:
+        raise typer.Exit(130)
 
 
 @app.command(epilog="Example: streamfeat doctor --json")

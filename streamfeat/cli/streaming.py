@@ -14,6 +14,7 @@ from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
     TopicOption,
     app,
@@ -56,7 +57,7 @@ def replay(
     ] = False,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")] = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
