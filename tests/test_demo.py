@@ -34,7 +34,7 @@ def test_from_nothing_to_predictions_and_what_to_type_next(tmp_path):
     result = run()
     assert result.exit_code == 0
     assert set(files(tmp_path / "streamfeat-demo")) == set(demo.FILES)
-    assert "% of 4" in result.stdout  # not a terminal, so lines of samples
+    assert "% of 1" in result.stdout  # not a terminal, so lines of samples
     assert "\x1b" not in result.stdout
     with open_recording("streamfeat-demo/test.mcap") as recording:
         assert len(recording.labels) == 4
