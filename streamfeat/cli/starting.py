@@ -52,7 +52,7 @@ def demo(
         raise InputError(f"{folder}: cannot be made: {error.strerror}; give another --folder") from error
     started = time.monotonic()
     try:
-        with progress_bars() as report:
+        with progress_bars(quiet=quiet) as report:
             job = Demo(folder, report)
             simulated = job.simulate()
             encoder = job.learn()
