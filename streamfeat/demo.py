@@ -38,8 +38,8 @@ SIZES = {"train": 200, "test": 40}
 
 _SAMPLE_US, _GAP_US = 300_000, 300_000
 """A sample is three saccades; the silence after it is one window."""
-_GEOMETRY = Geometry(patch=12, stride=2, n_bins=3, bin_us=100_000, max_count=2)
-_FILTERS, _VOLUMES, _ITERATIONS = 64, 6_000, 8
+_GEOMETRY = Geometry(patch=10, stride=2, n_bins=3, bin_us=100_000, max_count=2)
+_FILTERS, _VOLUMES, _ITERATIONS = 64, 4_000, 6
 _SPEED = 3.0
 """Stream seconds for each second of the live view: its forty digits take eight."""
 

@@ -82,6 +82,7 @@ class Replay:
         self,
         *,
         console: Console | None = None,
+        every_sample: bool = False,
         recording_out: Path | None = None,
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
@@ -91,6 +92,7 @@ class Replay:
 
         Args:
             console: for live lines.
+            every_sample: a line for each labelled sample, however fast they come.
             recording_out: MCAP file for features and predictions; replaced if it exists.
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
@@ -98,7 +100,7 @@ class Replay:
         """
         with open_recording(self._recording, self._topic) as rec:
             sinks = open_sinks(
-                partial(TerminalSink, console) if console else None,
+                partial(TerminalSink, console, every_sample=every_sample) if console else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
                 partial(TableSink, table, *self._shape_of_emissions) if table else None,

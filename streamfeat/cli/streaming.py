@@ -17,6 +17,7 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     TopicOption,
+    VerboseOption,
     app,
     out,
     print_losses,
@@ -58,6 +59,7 @@ def replay(
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
@@ -79,6 +81,7 @@ def replay(
     to_terminal = str(json_lines) == "-"
     job.run(
         console=None if quiet or as_json or to_terminal else out,
+        every_sample=verbose,
         recording_out=output,
         json_lines=sys.stdout if to_terminal else json_lines,
         with_features=features,
