@@ -10,6 +10,8 @@ Not here: networks that look at events themselves.
 from pathlib import Path
 
 import torch
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from torch.utils.data import DataLoader, Dataset
 
 import streamfeat as sf
@@ -22,8 +24,8 @@ RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 class Features(Dataset):
     """Labelled samples as pairs of features and class."""
 
-    def __init__(self, samples: list[Sample], encoder: sf.Encoder) -> None:
-        self.samples, self.step = samples, sf.EventFeatures(encoder)
+    def __init__(self, samples: list[Sample], steps: Pipeline) -> None:
+        self.samples, self.steps = samples, steps
         self.classes = sorted({sample.label.label for sample in samples})
 
     def __len__(self) -> int:
@@ -35,7 +37,7 @@ class Features(Dataset):
     def __getitems__(self, indices: list[int]) -> list[tuple[torch.Tensor, int]]:
         """A whole batch at once, which `DataLoader` asks for where it can."""
         samples = [self.samples[i] for i in indices]
-        rows = torch.from_numpy(normalise_features(self.step.transform(samples)))
+        rows = torch.from_numpy(self.steps.transform(samples))
         return [
             (row, self.classes.index(sample.label.label)) for row, sample in zip(rows, samples, strict=True)
         ]
@@ -44,14 +46,17 @@ class Features(Dataset):
 def main(epochs: int = 5) -> float:
     torch.manual_seed(0)
     encoder = sf.Encoder.load(RECORDINGS / "digits.safetensors")
-    data = {}
+    samples = {}
     for split in ("train", "test"):
         with sf.open_recording(RECORDINGS / f"digits_{split}.mcap") as recording:
-            data[split] = Features(list(recording.samples()), encoder)
+            samples[split] = list(recording.samples())
+    steps = make_pipeline(
+        sf.EventFeatures(encoder), FunctionTransformer(normalise_features), StandardScaler()
+    ).fit(samples["train"])
+    data = {split: Features(part, steps) for split, part in samples.items()}
 
-    n_features, n_classes = encoder.n_features, len(data["train"].classes)
-    network = torch.nn.Sequential(torch.nn.BatchNorm1d(n_features), torch.nn.Linear(n_features, n_classes))
-    optimiser = torch.optim.Adam(network.parameters(), lr=0.01)
+    network = torch.nn.Linear(encoder.n_features, len(data["train"].classes))
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
     for epoch in range(epochs):
         for features, labels in DataLoader(data["train"], batch_size=32, shuffle=True):
             optimiser.zero_grad()
@@ -60,7 +65,6 @@ def main(epochs: int = 5) -> float:
             optimiser.step()
         print(f"epoch {epoch}: loss {loss.item():.3f}")
 
-    network.eval()
     right = sum(
         int((network(features).argmax(1) == labels).sum())
         for features, labels in DataLoader(data["test"], batch_size=50)
