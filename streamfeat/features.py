@@ -172,17 +172,19 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
-        """Name each feature by its quadrant and filter: `(n_features,)` str, such as `top_left_17`.
+        """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
 
-        With the encoding `split` a filter has two, `top_left_17_pos` and `top_left_17_neg`.
+        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`.
 
         Args:
             input_features: samples have no features of their own, so it is ignored.
         """
         halves = ("_pos", "_neg") if self.encoder.encoding == "split" else ("",)
+        cells = range(self.encoder.geometry.pooling)
         names = [
-            f"{quadrant}_{k}{half}"
-            for quadrant in ("top_left", "top_right", "bottom_left", "bottom_right")
+            f"cell_{row}_{column}_{k}{half}"
+            for row in cells
+            for column in cells
             for half in halves
             for k in range(self.encoder.n_filters)
         ]
