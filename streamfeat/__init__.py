@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from streamfeat.classifier import Classifier, OnlineClassifier
+    from streamfeat.conventions import as_events
     from streamfeat.encoder import Encoder
     from streamfeat.engine import Engine
     from streamfeat.errors import InputError
@@ -31,6 +32,7 @@ __all__ = [
     "OnlineClassifier",
     "RecordingWriter",
     "TransformLearner",
+    "as_events",
     "make_events",
     "open_recording",
 ]
@@ -47,6 +49,7 @@ _HOMES = {
     "OnlineClassifier": "classifier",
     "RecordingWriter": "recorder",
     "TransformLearner": "learn.transform",
+    "as_events": "conventions",
     "make_events": "events",
     "open_recording": "recording",
 }

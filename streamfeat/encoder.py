@@ -15,6 +15,7 @@ from typing import Any, Literal, Protocol, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.conventions import as_events
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
@@ -179,14 +180,19 @@ class Encoder:
         `t_us` (inverse formulation: both are within the duality gap).
 
         Args:
-            events: `(n,)` EVENT_DTYPE in any order; those outside the sensor or the window are ignored.
+            events: `(n,)` EVENT_DTYPE in any order, or a structured array of another tool (see `as_events`);
+                those outside the sensor or the window are ignored.
             resolution: `(height, width)` of the sensor.
             origin_us: start of bin 0; the time of the first event if not given.
             t_us: a time in the last bin of the window; the time of the last event if not given.
 
         Returns:
             `(n_features,)` float32.
+
+        Raises:
+            InputError: `events` are no events.
         """
+        events = as_events(events)
         return encode_window(self.geometry, self.operator, events, resolution, origin_us, t_us)
 
     def save(self, path: str | Path) -> None:

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.conventions import as_events
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
-from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.events import Events, Resolution
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow, trace
 from streamfeat.kernels.ingest import advance_to_bin, count_events
@@ -136,11 +137,12 @@ class Engine:
         """Count the events of a batch. Exact, whatever the order, and cheap.
 
         Args:
-            batch: `(n,)` EVENT_DTYPE, not changed. Any content: what cannot be used is counted in
-                `stats()` as `late` or `rejected`.
+            batch: `(n,)` EVENT_DTYPE, not changed; or a structured array of another tool, which is converted
+                (see `as_events`). Any content: what cannot be used is counted in `stats()` as `late` or
+                `rejected`.
 
         Raises:
-            InputError: not an array of EVENT_DTYPE.
+            InputError: not such an array, or one whose polarities mean nobody knows what.
         """
         events = self._checked(batch)
         count_events(events, self._operator, self._state)
@@ -154,7 +156,7 @@ class Engine:
             batch: as for `feed`.
 
         Raises:
-            InputError: not an array of EVENT_DTYPE.
+            InputError: as for `feed`.
         """
         events = self._checked(batch)
         self._update()
@@ -171,7 +173,7 @@ class Engine:
             had been accepted by then.
 
         Raises:
-            InputError: not an array of EVENT_DTYPE.
+            InputError: as for `feed`.
         """
         events = self._checked(batch)
         self._update()
@@ -222,11 +224,10 @@ class Engine:
 
     @staticmethod
     def _checked(batch: Events) -> Events:
-        if not isinstance(batch, np.ndarray) or batch.dtype != EVENT_DTYPE or batch.ndim != 1:
-            raise InputError(f"a batch must be a one-dimensional array of {EVENT_DTYPE}")
-        if not (batch.flags.writeable and batch.flags.c_contiguous):
-            return batch.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
-        return batch
+        events = as_events(batch)
+        if not (events.flags.writeable and events.flags.c_contiguous):
+            return events.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
+        return events
 
     def advance(self, t_us: int) -> None:
         """Let stream time pass without events. Going back in time does nothing.

@@ -145,7 +145,8 @@ def training_set(
 class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turn labelled samples into features, as a step of a scikit-learn `Pipeline`.
 
-    Stateless: the encoder is learned beforehand, without labels.
+    Stateless: the encoder is learned beforehand, without labels. `set_output(transform="pandas")` makes its
+    output a data frame, as everywhere in scikit-learn.
 
     Args:
         encoder: the frozen encoder.
@@ -169,6 +170,25 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """
         rows = [features for _, features in encode_samples(self.encoder, _checked(X), threads=self.threads)]
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
+        """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
+
+        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`.
+
+        Args:
+            input_features: samples have no features of their own, so it is ignored.
+        """
+        halves = ("_pos", "_neg") if self.encoder.encoding == "split" else ("",)
+        cells = range(self.encoder.geometry.pooling)
+        names = [
+            f"cell_{row}_{column}_{k}{half}"
+            for row in cells
+            for column in cells
+            for half in halves
+            for k in range(self.encoder.n_filters)
+        ]
+        return np.array(names, object)
 
     def __sklearn_is_fitted__(self) -> bool:
         """Say that there is nothing to fit."""

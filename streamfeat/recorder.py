@@ -16,6 +16,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
+from streamfeat.conventions import as_events
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
@@ -156,14 +157,15 @@ class RecordingWriter:
         """Write a batch as one or more packets, each at the time of its first event.
 
         Args:
-            events: `(n,)` array of `EVENT_DTYPE`, not changed; n may be 0, which writes nothing.
+            events: `(n,)` array of `EVENT_DTYPE`, not changed, or a structured array of another tool (see
+                `as_events`); n may be 0, which writes nothing.
             resolution: `(height, width)` of the sensor.
 
         Raises:
             InputError: the encoding cannot represent the events (see `streamfeat.codecs.encode`), or a
                 time is negative or 2^31 s or more.
         """
-        for packet in self._packets.messages(events, resolution):
+        for packet in self._packets.messages(as_events(events), resolution):
             self._write(self._event_topic, packet)
 
     def write_label(self, label: Label, topic: str = "/label") -> None:

@@ -22,6 +22,7 @@ from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label, Packet, open_recording
 from streamfeat.session import Session
 from streamfeat.sinks import JsonLinesSink, RecordingSink, TerminalSink, open_sinks
+from streamfeat.table import TableSink
 
 __all__ = ["Replay", "items_of_split", "parse_speed"]
 
@@ -71,6 +72,7 @@ class Replay:
                 raise InputError(f"{recording}: has no samples of split {split!r}")
         if reader:
             reader.check_fits(encoder, path=classifier or "the classifier")
+        self._shape_of_emissions = encoder.n_features, reader.labels if reader else ()
         self._session = Session(encoder, policy, reader, learn_online=learn_online, clock=time.perf_counter)
         self._seconds = 0.0
         self.interrupted = False
@@ -80,23 +82,28 @@ class Replay:
         self,
         *,
         console: Console | None = None,
+        every_sample: bool = False,
         recording_out: Path | None = None,
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
+        table: Path | None = None,
     ) -> None:
         """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
 
         Args:
             console: for live lines.
+            every_sample: a line for each labelled sample, however fast they come.
             recording_out: MCAP file for features and predictions; replaced if it exists.
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
+            table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
         """
         with open_recording(self._recording, self._topic) as rec:
             sinks = open_sinks(
-                partial(TerminalSink, console) if console else None,
+                partial(TerminalSink, console, every_sample=every_sample) if console else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
+                partial(TableSink, table, *self._shape_of_emissions) if table else None,
             )
             items = items_of_split(rec.items(), self._split)
             pipeline: Pipeline[Packet | Label, Emission] = Pipeline(

@@ -155,11 +155,15 @@ class TerminalSink:
     Args:
         console: where to print.
         clock: seconds, monotonic.
+        every_sample: show each labelled sample, however fast they come.
     """
 
-    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, console: Console, clock: Callable[[], float] = time.monotonic, *, every_sample: bool = False
+    ) -> None:
         """Start with nothing seen."""
         self._console = console
+        self._every_sample = every_sample
         self._clock = clock
         self._next = 0.0
         self._samples = 0
@@ -169,6 +173,13 @@ class TerminalSink:
     def write(self, emissions: Sequence[Emission]) -> None:
         """Count every emission, and show one where it is time to."""
         finals = [e for e in emissions if e.final]
+        if self._every_sample:
+            for e in finals:
+                self._samples, self._correct = self._samples + 1, self._correct + bool(e.correct)
+                self._console.print(self._line(e), highlight=False)
+            finals, emissions = [], [e for e in emissions if not e.final]
+            if not emissions:
+                return
         self._samples += len(finals)
         self._correct += sum(bool(e.correct) for e in finals)
         self._skipped += len(finals)

@@ -270,6 +270,9 @@ def test_the_terminal_shows_samples_and_a_summary(run, home):
     assert "% of" in result.out
     assert "accuracy" in result.out
     assert "% of" not in run("replay", home / "test.mcap", *arguments, "-q").out
+    lines = run("replay", home / "test.mcap", *arguments, "--verbose").out.splitlines()
+    assert [f"% of {i}" in line for i, line in enumerate(lines[:10], 1)] == [True] * 10
+    assert not any("more than a reader" in line for line in lines)
 
 
 def test_a_split_and_a_speed(run, home):

@@ -1,5 +1,6 @@
 """Features as a step of scikit-learn: cloned, searched over, cached, and refused what is not a sample."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,39 @@ def test_features_are_a_scikit_learn_transformer(digits):
     assert few.dtype == np.float32
     assert few.shape == (5, encoder.n_features)
     assert np.array_equal(few, copied.transform(iter(train[:5])))
+
+
+@pytest.mark.parametrize("pooling", [2, 3])
+@pytest.mark.parametrize("encoding", ["soft", "split", "triangle"])
+def test_features_are_named_by_cell_and_filter(encoding, pooling):
+    """Only the last volume of the first row sees events; codes of one sign fall into one half."""
+    geometry = dataclasses.replace(tiny.GEOMETRY, pooling=pooling)
+    model = tiny.encoder(encoding=encoding, k=3, geometry=geometry)
+    names = sf.EventFeatures(model).get_feature_names_out()
+    assert len(set(names)) == len(names) == model.n_features
+    events = tiny.steady(0, 90_000, 60, resolution=(4, 4))
+    events["x"] += 12
+    features = model.encode(events, tiny.RESOLUTION)
+    assert {name[:9] for name in names[features != 0]} == {f"cell_0_{pooling - 1}_"}
+    if encoding == "split":
+        engine = sf.Engine(model, tiny.RESOLUTION, origin_us=int(events["t"][0]))
+        engine.feed(events)
+        code = engine.codes()[0, -1]
+        expected = {
+            f"cell_0_{pooling - 1}_{k}_{'pos' if code[k] > 0 else 'neg'}" for k in np.flatnonzero(code)
+        }
+        assert set(names[features != 0]) == expected
+
+
+def test_features_come_as_a_data_frame(digits):
+    pytest.importorskip("pandas", reason="extra export is not installed")
+    train, _, encoder = digits
+    step = sf.EventFeatures(encoder).set_output(transform="pandas")
+    frame = step.fit_transform(train[:3])
+    assert list(frame.columns) == list(step.get_feature_names_out())
+    np.testing.assert_array_equal(
+        frame.to_numpy(), sf.EventFeatures(encoder).transform(train[:3]), strict=True
+    )
 
 
 def test_what_is_not_a_sample_is_refused(digits):

@@ -14,7 +14,7 @@ PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
-    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine"},
+    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine", "conventions"},
     {
         "kernels.code",
         "kernels.decode",
@@ -29,12 +29,12 @@ LAYERS = [
     {"kernels.follow"},
     {"operator", "state", "recording"},
     {"window", "recorder", "emission"},
-    {"encoder", "sinks", "report"},
+    {"encoder", "sinks", "report", "table", "terminal_view"},
     {"engine", "classifier", "features", "foreign", "learn"},
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
-    {"evaluate", "latency"},
+    {"evaluate", "latency", "demo", "doctor"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -63,7 +63,7 @@ ROOMS = {
     ],
     "cli": [
         {"options", "program"},
-        {"evaluating", "learning", "live", "measuring", "recordings", "streaming"},
+        {"evaluating", "learning", "live", "measuring", "recordings", "starting", "streaming"},
     ],
 }
 """The same inside packages that are one place in the layers."""
@@ -81,12 +81,14 @@ ONLY_IN = {
         "cli.learning",
         "cli.live",
         "cli.measuring",
+        "cli.starting",
         "cli.streaming",
     },
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
-    "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
+    "pyarrow": {"table"},
+    "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch", "doctor"},
 }
 
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}

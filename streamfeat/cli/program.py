@@ -18,11 +18,15 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
+    Task,
     TextColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
+from typer.core import TyperGroup
 
 from streamfeat.errors import InputError
 
@@ -33,9 +37,11 @@ __all__ = [
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
+    "QuietOption",
     "RecordingArgument",
     "RecordingsArgument",
     "TopicOption",
+    "VerboseOption",
     "app",
     "err",
     "out",
@@ -45,8 +51,22 @@ __all__ = [
     "refuse_existing",
 ]
 
+_ORDER = ("demo", "info", "convert", "learn", "train", "replay", "evaluate", "latency", "view")
+_LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
+
+
+class _InOrder(TyperGroup):
+    """Commands in the order in which somebody new needs them, not in that of imports."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        names = super().list_commands(ctx)
+        known = [*_ORDER, *(name for name in names if name not in _ORDER + _LAST), *_LAST]
+        return [name for name in known if name in names]
+
+
 app = typer.Typer(
     name="streamfeat",
+    cls=_InOrder,
     help="Learned features from event cameras: event by event, exact, and never behind.",
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -63,26 +83,48 @@ RecordingsArgument = Annotated[
 TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
+_NARROW = 90
+"""Columns below which bars are short, so that rate and time left stay in sight."""
+
+
+class _RateColumn(ProgressColumn):
+    """Steps a second, once there are some."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:,.{0 if speed >= 10 else 1}f}/s" if speed else "", style="dim")
+
+
 @contextlib.contextmanager
-def progress_bars(*, from_a_thread: bool = True) -> Iterator[Callable[[str, int, int, str], None]]:
+def progress_bars(
+    *, from_a_thread: bool = True, quiet: bool = False
+) -> Iterator[Callable[[str, int, int, str], None]]:
     """A function (step, done, of how many, remark) that keeps a bar for each step on standard error.
+
+    A bar says how many are done, how many a second, and how long the rest will take. Nothing is shown where
+    standard error is no terminal.
 
     Args:
         from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
             called, once a second at most, so that nothing else runs while somebody measures.
+        quiet: show nothing.
     """
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=40 if err.width >= _NARROW else 10),
         MofNCompleteColumn(),
+        _RateColumn(),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         TextColumn("[dim]{task.fields[remark]}"),
     )
-    with Progress(*columns, console=err, disable=not err.is_terminal, auto_refresh=from_a_thread) as progress:
+    hidden = quiet or not err.is_terminal
+    with Progress(*columns, console=err, disable=hidden, auto_refresh=from_a_thread) as progress:
         tasks: dict[str, Any] = {}
         drawn = 0.0
 
@@ -115,7 +157,7 @@ def print_result(result: dict[str, Any], title: str, *, as_json: bool) -> None:
         return
     table = Table(title=title, show_header=False, title_justify="left", box=None, pad_edge=False)
     table.add_column(style="dim")
-    table.add_column()
+    table.add_column(overflow="fold")  # or a long path would lose its end in a narrow terminal
     for name, value in result.items():
         text = f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
         table.add_row(name.replace("_", " "), escape(text))

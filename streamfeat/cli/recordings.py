@@ -5,7 +5,7 @@ Not here: reading and writing (`recording`, `recorder`, `foreign`).
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -13,6 +13,7 @@ from rich.markup import escape
 from streamfeat.cli.program import (
     JsonOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
     TopicOption,
     app,
@@ -24,6 +25,8 @@ from streamfeat.cli.program import (
 from streamfeat.errors import InputError
 
 __all__ = ["convert", "info"]
+
+_FAULTS_SHOWN = 20
 
 
 @app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
@@ -72,14 +75,19 @@ def convert(
     encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
     compression: Annotated[str, typer.Option(help="Chunks: zstd, lz4 or none.")] = "zstd",
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="List every file with a fault.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A data set folder or a camera file to MCAP, with labels and splits from the folder layout."""
+    """A data set folder or a camera file to MCAP, with labels and splits from the folder layout.
+
+    Files that cannot be read are reported, and the others converted; the exit status is 1 then.
+    """
     from streamfeat.foreign import datasets
 
     if not 0 < gap_ms < 1e9:
         raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
-    with progress_bars() as report:
+    with progress_bars(quiet=quiet) as report:
         done = datasets.convert(
             source,
             target,
@@ -92,7 +100,7 @@ def convert(
             limit=limit,
             progress=lambda n, total: report("converting", n, total, ""),
         )
-    result = {
+    result: dict[str, Any] = {
         "written": str(target),
         "samples": done.samples,
         "events": done.events,
@@ -101,9 +109,21 @@ def convert(
         "failed": len(done.failed),
         "damaged": len(done.damaged),
     }
+    faults = {"failed": done.failed, "damaged": done.damaged}
+    if as_json:
+        result["faults"] = [
+            {"file": str(path), "what": what, "reason": reason}
+            for what, files in faults.items()
+            for path, reason in files
+        ]
     print_result(result, "converted", as_json=as_json)
-    for what, files in (("failed", done.failed), ("damaged", done.damaged)):
-        for path, reason in files[:20]:
-            err.print(f"[yellow]{what}:[/] {escape(f'{path}: {reason}')}", soft_wrap=True)
+    for what, files in faults.items():
+        shown = files if verbose else files[:_FAULTS_SHOWN]
+        for path, reason in shown:
+            # What the reason begins with is the file already.
+            where = reason if reason.startswith(str(path)) else f"{path}: {reason}"
+            err.print(f"[yellow]{what}:[/] {escape(where)}", soft_wrap=True)
+        if len(shown) < len(files):
+            err.print(f"[yellow]{what}:[/] {len(files) - len(shown):,} more; --verbose lists all")
     if done.failed or done.damaged:
         raise typer.Exit(1)

@@ -14,8 +14,10 @@ from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
     TopicOption,
+    VerboseOption,
     app,
     out,
     print_losses,
@@ -46,19 +48,24 @@ def replay(
         typer.Option(help="Write a JSON line for each emission to this file; - is stdout."),
     ] = None,
     features: Annotated[bool, typer.Option("--features", help="Include features in JSON lines.")] = False,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="Write features and predictions to this .parquet or .arrow file; extra `export`."),
+    ] = None,
     split: Annotated[str | None, typer.Option(help="Replay only samples of this split.")] = None,
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
     ] = False,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")] = False,
+    quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
     from streamfeat.replay import Replay
 
-    for path in (output, json_lines):
+    for path in (output, json_lines, table):
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
     job = Replay(
@@ -74,9 +81,11 @@ def replay(
     to_terminal = str(json_lines) == "-"
     job.run(
         console=None if quiet or as_json or to_terminal else out,
+        every_sample=verbose,
         recording_out=output,
         json_lines=sys.stdout if to_terminal else json_lines,
         with_features=features,
+        table=table,
     )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)

@@ -110,7 +110,9 @@ def find_samples(folder: str | Path) -> list[SamplePath]:
     for path in folder.rglob("*"):
         *above, _ = parts = path.relative_to(folder).parts
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
-        if hidden or path.suffix.lower() not in EXTENSIONS or not above or not path.is_file():
+        # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
+        is_there = path.is_file() or (path.is_symlink() and not path.exists())
+        if hidden or path.suffix.lower() not in EXTENSIONS or not above or not is_there:
             continue
         if len(above) == 1 and _split_of(above[0]):
             continue  # a file right inside a split has no label

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.conventions import FIELD_NAMES
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
 from streamfeat.foreign.words import BLOCK_BYTES, Source, checked_resolution
@@ -28,7 +29,6 @@ __all__ = [
     "text_resolution",
 ]
 
-_ALIASES = {"x": ("x",), "y": ("y",), "p": ("p", "on", "polarity"), "t": ("t", "ts", "timestamp")}
 _LARGEST_UNPACKED = 2 << 30  # bytes of an .npz in memory at once
 HEAD_BYTES = 65_536  # of a text file, in which its layout must show
 _LARGEST = {"x": 0xFFFF, "y": 0x7FFF, "p": 1, "t": (1 << 31) * 1_000_000 - 1}
@@ -88,7 +88,7 @@ def named_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> dict[str, 
     Raises:
         InputError: one is missing, or they are not numbers of one length.
     """
-    found = {k: next((columns[a] for a in names if a in columns), None) for k, names in _ALIASES.items()}
+    found = {k: next((columns[a] for a in names if a in columns), None) for k, names in FIELD_NAMES.items()}
     picked = {k: column for k, column in found.items() if column is not None}
     shapes = {column.shape for column in picked.values()}
     if len(picked) < 4 or len(shapes) != 1 or len(shapes.pop()) != 1:
@@ -137,7 +137,7 @@ def _text_layout(path: Path, head: bytes) -> _TextLayout:
         if len(fields) == 2 and resolution is None:
             resolution = checked_resolution(path, fields[1], fields[0])
         elif all(name.isidentifier() for name in fields):
-            found = [next((fields.index(a) for a in _ALIASES[k] if a in fields), -1) for k in "txyp"]
+            found = [next((fields.index(a) for a in FIELD_NAMES[k] if a in fields), -1) for k in "txyp"]
             if min(found) < 0:
                 raise InputError(f"{path}: columns {line:.80} lack one of t, x, y, p")
             order = (found[0], found[1], found[2], found[3])

@@ -1,0 +1,167 @@
+"""From nothing to predictions: simulate, learn, train, replay, with what every installation has.
+
+Lives here: the steps of the demonstration and their sizes.
+Not here: each step itself (`simulate`, `learn`, `classifier`, `session`), and the command (`cli`).
+"""
+
+import shlex
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from streamfeat.classifier import Classifier, train_classifier
+from streamfeat.emission import Emission, EmitPolicy
+from streamfeat.encoder import Encoder
+from streamfeat.features import encode_samples
+from streamfeat.geometry import Geometry
+from streamfeat.learn.fit import learn_encoder
+from streamfeat.packets import Packet
+from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.recorder import RecordingWriter
+from streamfeat.recording import Label, open_recording
+from streamfeat.session import Session
+from streamfeat.simulate import CameraModel, digit_samples
+from streamfeat.sinks import Sink, TerminalSink
+from streamfeat.terminal_view import EventPicture, TerminalView
+
+__all__ = ["FILES", "Demo"]
+
+FILES = ("train.mcap", "test.mcap", "model", "classifier")
+"""What the demonstration writes."""
+
+SIZES = {"train": 200, "test": 40}
+"""Digits of each recording."""
+
+_SAMPLE_US, _GAP_US = 300_000, 300_000
+"""A sample is three saccades; the silence after it is one window."""
+_GEOMETRY = Geometry(patch=10, stride=2, n_bins=3, bin_us=100_000, max_count=2)
+_FILTERS, _VOLUMES, _ITERATIONS = 64, 4_000, 6
+_SPEED = 3.0
+"""Stream seconds for each second of the live view: its forty digits take eight."""
+
+Report = Callable[[str, int, int, str], None]
+
+
+class Demo:
+    """The steps, each of which needs those before it.
+
+    Args:
+        folder: where `FILES` are written, replaced if they exist.
+        report: told about progress, as (step, done, of how many, remark).
+    """
+
+    def __init__(self, folder: Path, report: Report = lambda step, done, total, remark: None) -> None:
+        """Nothing is written before `simulate`."""
+        self.train, self.test, self.model, self.classifier = (folder / name for name in FILES)
+        self._report = report
+        self.interrupted = False
+
+    def simulate(self) -> int:
+        """Write both recordings, and return how many events they have."""
+        total, n_events = sum(SIZES.values()), 0
+        self._report("simulating", 0, total, "")
+        for path, split, before in ((self.train, "train", 0), (self.test, "test", SIZES["train"])):
+            with RecordingWriter(path, overwrite=True) as writer:
+                start_us = _GAP_US
+                for i, sample in enumerate(digit_samples(SIZES[split], 0, split), 1):
+                    events = sample.events
+                    events["t"] += start_us
+                    writer.write_label(Label(start_us, _SAMPLE_US, sample.label, split, sample.source))
+                    writer.write_events(events, CameraModel().resolution)
+                    n_events += len(events)
+                    start_us += _SAMPLE_US + _GAP_US
+                    self._report("simulating", before + i, total, path.name)
+        return n_events
+
+    def learn(self) -> Encoder:
+        """Learn features from the training recording, without its labels.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, as anywhere else; here it would only end the learning.
+        """
+        with open_recording(self.train) as recording:
+            encoder = learn_encoder(
+                [recording],
+                _GEOMETRY,
+                n_filters=_FILTERS,
+                n_volumes=_VOLUMES,
+                max_iter=_ITERATIONS,
+                report=self._report,
+            )
+        if encoder.provenance["interrupted"]:
+            raise KeyboardInterrupt
+        encoder.save(self.model)
+        return encoder
+
+    def fit(self, encoder: Encoder) -> Classifier:
+        """Train a classifier on the labelled samples of the training recording."""
+        features, labels = [], []
+        with open_recording(self.train) as recording:
+            for label, row in encode_samples(encoder, recording.samples()):
+                features.append(row)
+                labels.append(label.label)
+                self._report("encoding", len(labels), SIZES["train"], "")
+        self._report("training", 0, 1, "")
+        classifier = train_classifier(np.stack(features), labels, encoder)
+        self._report("training", 1, 1, "")
+        classifier.save(self.classifier)
+        return classifier
+
+    def replay(self, encoder: Encoder, classifier: Classifier, console: Console | None) -> dict[str, Any]:
+        """Replay the test recording, live where a console is given, and return what came of it.
+
+        A console that is no terminal, or one too narrow, gets lines. Without one nothing waits for the clock.
+        """
+        session = Session(encoder, EmitPolicy.parse("10ms"), classifier, clock=time.perf_counter)
+        with open_recording(self.test) as recording:
+            view = (
+                TerminalView(console, recording.resolution)
+                if console and TerminalView.fits(console)
+                else None
+            )
+            sinks: list[Sink[Emission]] = [view or TerminalSink(console)] if console else []
+            pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
+                recording.items(),
+                _Watched(session, view.picture) if view else session,
+                sinks,
+                speed=_SPEED if console else None,
+            )
+            self.interrupted = run_until_interrupted([pipeline])
+        stats = session.stats()
+        return {
+            "events": stats.events,
+            "emissions": stats.emissions,
+            "samples": stats.samples,
+            "correct": stats.correct,
+            "accuracy": round((stats.correct or 0) / max(stats.samples, 1), 4),
+        }
+
+    def commands(self) -> list[str]:
+        """What to try next, as a shell takes it."""
+        train, test, model, classifier = (
+            shlex.quote(str(path)) for path in (self.train, self.test, self.model, self.classifier)
+        )
+        return [
+            f"streamfeat replay {test} -m {model} -c {classifier} --emit event",
+            f"streamfeat latency {test} -m {model}",
+            f"streamfeat evaluate {train} {test} --patch 8 --filters 50 --method direct --method counts",
+        ]
+
+
+class _Watched:
+    """A session whose events are drawn: they are when they are processed, not when they were read."""
+
+    def __init__(self, session: Session, picture: EventPicture) -> None:
+        self._session, self._picture = session, picture
+
+    def process(self, item: Packet | Label) -> Iterator[Emission]:
+        if isinstance(item, Packet):
+            self._picture.add(item.events)
+        return self._session.process(item)
+
+    def finish(self) -> Iterator[Emission]:
+        return self._session.finish()

@@ -1,0 +1,169 @@
+"""The command line in a terminal: help, completion, colour, sixty columns, a few faults among many files."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from streamfeat import cli
+from streamfeat.recording import open_recording
+
+ESCAPE = re.compile(r"\x1b\[([0-9;]*)m")
+COMMAND = [
+    sys.executable,
+    "-c",
+    "import sys; sys.argv[0] = 'streamfeat'; from streamfeat.cli import main; main()",
+]
+
+
+def run(*arguments, **options):
+    return CliRunner().invoke(cli.app, [*map(str, arguments)], **options)
+
+
+def in_a_terminal(tmp_path, *arguments, columns=60, **environment):
+    """What the command writes to a terminal of so many columns, both outputs together."""
+    pty, fcntl, termios = (pytest.importorskip(name) for name in ("pty", "fcntl", "termios"))
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, np.array([40, columns, 0, 0], np.uint16).tobytes())
+    kept = {k: v for k, v in os.environ.items() if k not in {"NO_COLOR", "FORCE_COLOR", "COLUMNS", "CI"}}
+    environment = kept | {"TERM": "xterm-256color", "COLORTERM": "truecolor"} | environment
+    process = subprocess.Popen(
+        [*COMMAND, *map(str, arguments)],
+        stdin=follower,
+        stdout=follower,
+        stderr=follower,
+        env=environment,
+        cwd=tmp_path,
+    )
+    os.close(follower)
+    written = b""
+    while True:
+        try:
+            block = os.read(leader, 65536)
+        except OSError:  # the other end is closed
+            break
+        if not block:
+            break
+        written += block
+    os.close(leader)
+    return process.wait(60), written.decode()
+
+
+def sample_folder(folder, n, bad=()):
+    """A folder of `n` tiny files in the layout of N-MNIST; those in `bad` cannot be read."""
+    for i in range(n):
+        path = folder / "Train" / str(i % 2) / f"{i:05}.bin"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if i in bad:
+            path.symlink_to(folder / "nowhere.bin")
+        else:
+            path.write_bytes(bytes([i % 30, 3, 0x80, 0, i % 200, 5, 5, 0, 1, i % 200]))
+    return folder
+
+
+def test_commands_stand_in_the_order_in_which_they_are_needed():
+    names = re.findall(r"^[│ ] ([a-z]+)  ", run("--help").stdout, re.MULTILINE)
+    assert names[:3] == ["demo", "info", "convert"]
+    assert names[-1] == "doctor"
+    assert set(names) == {
+        command.name or command.callback.__name__ for command in cli.app.registered_commands
+    }
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_shown_and_completes(shell, monkeypatch):
+    # Whoever tests has no shell above them that could be looked for.
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "true")
+    shown = run("--show-completion", shell)
+    assert shown.exit_code == 0
+    assert "_STREAMFEAT_COMPLETE" in shown.stdout
+    environment = {
+        "_STREAMFEAT_COMPLETE": f"complete_{shell}",
+        "COMP_WORDS": "streamfeat re",
+        "COMP_CWORD": "1",
+        "_TYPER_COMPLETE_ARGS": "streamfeat re",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
+    completed = run(env=environment, prog_name="streamfeat")
+    for name in ("replay", "record", "recover"):
+        assert name in completed.stdout
+    assert "latency" not in completed.stdout
+
+
+@pytest.mark.parametrize("command", [None, *sorted(c.callback.__name__ for c in cli.app.registered_commands)])
+def test_help_fits_into_sixty_columns(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("TERMINAL_WIDTH", "60")
+    arguments = [command, "--help"] if command else ["--help"]
+    shown = run(*arguments)
+    assert shown.exit_code == 0
+    assert max(map(len, shown.stdout.splitlines())) <= 60
+
+
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_colour_is_for_terminals_and_for_who_wants_it(tmp_path, no_color):
+    sample_folder(tmp_path / "in", 3, bad=[1])
+    environment = {"NO_COLOR": no_color} if no_color else {}
+    status, written = in_a_terminal(tmp_path, "convert", "in", "out.mcap", **environment)
+    assert status == 1
+    assert "00001.bin" in written
+    colours = {code for codes in ESCAPE.findall(written) for code in codes.split(";") if code[:1] in "349"}
+    colours = {code for code in colours if len(code) == 2}
+    assert bool(colours) == (not no_color)
+
+
+def test_no_line_is_wider_than_a_terminal_of_sixty_columns(tmp_path):
+    """But for paths and reasons, which a terminal wraps by itself, so that they can be copied."""
+    sample_folder(tmp_path / "in", 3)
+    status, written = in_a_terminal(tmp_path, "convert", "in", "out.mcap")
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written)
+    assert status == 0
+    assert "3/3" in plain
+    assert "/s" in plain
+    assert max(map(len, re.split(r"[\r\n]+", plain))) <= 60
+    assert "3/3" not in in_a_terminal(tmp_path, "convert", "in", "quiet.mcap", "--quiet")[1]
+
+
+def test_output_that_is_no_terminal_has_neither_colour_nor_bars(tmp_path):
+    sample_folder(tmp_path / "in", 3, bad=[1])
+    command = [*COMMAND, "convert", "in", "out.mcap"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert "\x1b" not in done.stdout + done.stderr
+    assert "converting" not in done.stderr
+
+
+def test_a_few_unreadable_samples_among_many(tmp_path):
+    bad = range(7, 500, 20)
+    sample_folder(tmp_path / "in", 500, bad)
+    done = run("convert", tmp_path / "in", tmp_path / "out.mcap")
+    assert done.exit_code == 1
+    with open_recording(tmp_path / "out.mcap") as recording:
+        assert len(recording.labels) == 475
+        assert not {label.source for label in recording.labels} & {f"Train/1/{i:05}.bin" for i in bad}
+    faults = done.stderr.splitlines()
+    assert len(faults) == 21
+    assert all("No such file" in line and ".bin" in line for line in faults[:20])
+    assert faults[-1] == "failed: 5 more; --verbose lists all"
+    table = re.sub(r" +", " ", done.stdout)
+    assert "samples 475" in table
+    assert "failed 25" in table
+    again = ["convert", tmp_path / "in", tmp_path / "out.mcap", "--overwrite"]
+    assert len(run(*again, "--verbose").stderr.splitlines()) == 25
+    said = json.loads(run(*again, "--json").stdout)
+    assert (said["samples"], said["failed"], len(said["faults"])) == (475, 25, 25)
+    assert {fault["what"] for fault in said["faults"]} == {"failed"}
+    assert said["faults"][0]["file"].endswith("Train/1/00007.bin")
+
+
+def test_one_file_that_cannot_be_read_leaves_no_recording(tmp_path):
+    sample_folder(tmp_path / "in", 2, bad=[0, 1])
+    done = run("convert", tmp_path / "in", tmp_path / "out.mcap")
+    assert isinstance(done.exception, cli.InputError)
+    assert "none of the 2 samples can be read" in str(done.exception)
+    assert not (tmp_path / "out.mcap").exists()

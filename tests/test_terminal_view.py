@@ -1,0 +1,106 @@
+"""The live picture: which character is lit where, and what a terminal must have for it."""
+
+import io
+
+import numpy as np
+import pytest
+import tiny
+from rich.console import Console
+
+from streamfeat.emission import Emission
+from streamfeat.events import make_events
+from streamfeat.recording import Label
+from streamfeat.terminal_view import EventPicture, TerminalView
+
+
+def terminal(width=60, **options):
+    # `legacy_windows` would turn blocks off; the encoding is that of the file.
+    file = io.TextIOWrapper(io.BytesIO(), encoding=options.pop("encoding", "utf-8"))
+    options = {"force_terminal": True, "color_system": "truecolor", "_environ": {}} | options
+    return Console(file=file, width=width, height=40, **options)
+
+
+def lines(picture, now_us):
+    return [line.rstrip() for line in picture.draw(now_us).plain.split("\n")]
+
+
+def test_a_character_is_two_pixels():
+    picture = EventPicture((4, 6))
+    picture.add(make_events([0, 1, 2, 2, 3], [0, 1, 0, 1, 3], [1, 0, 1, 1, 0], [5] * 5))
+    assert lines(picture, 5) == ["▀▄█", "   ▄"]
+
+
+def test_what_is_on_is_warm_and_what_is_off_is_blue():
+    picture = EventPicture((2, 2))
+    picture.add(make_events([0, 1], [0, 0], [1, 0], [5, 5]))
+    warm, blue = (span.style.color.triplet for span in picture.draw(5).spans)
+    assert warm.red > warm.blue
+    assert blue.blue > blue.red
+
+
+def test_light_fades_with_stream_time_however_often_it_is_drawn():
+    picture = EventPicture((2, 2))
+    picture.add(make_events([0, 1], [0, 0], [1, 1], [0, 100_000]))
+    assert lines(picture, 100_000) == [" ▀"]
+    assert lines(picture, 100_000) == [" ▀"]
+    assert lines(picture, 200_000) == [""]
+
+
+def test_a_wide_sensor_is_drawn_smaller_and_what_is_outside_not_at_all():
+    picture = EventPicture((480, 640), columns=32)
+    picture.add(make_events([639, 700, 639], [479, 0, 9999], [1, 1, 1], [0] * 3))
+    drawn = lines(picture, 0)
+    assert (len(drawn), len(drawn[-1])) == (12, 32)
+    assert drawn[-1].strip() == "▄"
+    assert not any(drawn[:-1])
+
+
+@pytest.mark.parametrize(
+    ("options", "fits"),
+    [
+        ({}, True),
+        ({"width": 59}, False),
+        ({"force_terminal": False}, False),
+        ({"encoding": "ascii"}, False),
+        ({"_environ": {"TERM": "dumb"}}, False),
+        ({"no_color": True}, True),
+    ],
+)
+def test_what_a_terminal_must_have(options, fits):
+    assert TerminalView.fits(terminal(**options)) == fits
+
+
+@pytest.mark.parametrize("no_color", [False, True])
+def test_sixty_columns_hold_picture_bars_and_counts(no_color):
+    console = terminal(no_color=no_color)
+    now = 0.0
+    view = TerminalView(console, (34, 34), clock=lambda: now)
+    sample = Label(0, 100, "5", "test")
+    labels = tuple("0123456789")
+    for i in range(4):
+        scores = np.eye(10, dtype=np.float32)[5 if i else 3]
+        view.picture.add(tiny.steady(i * 100, i * 100 + 100, 50, resolution=(34, 34)))
+        view.write([Emission(i * 100, i, np.zeros(4, np.float32), labels, scores, sample, True)])
+    console.file.seek(0)
+    # The clock stood still, so only the first was drawn so far.
+    assert "0 % of 1 right" in console.file.read()
+    view.close(failed=False)
+    console.file.seek(0)
+    written = console.file.read()
+    assert "75 % of 4 right" in written
+    assert "this is a 5" in written
+    assert ("38;2;" in written) == (not no_color)
+    assert "━" in written
+
+
+def test_features_without_a_classifier_are_drawn_too():
+    console = terminal()
+    view = TerminalView(console, (34, 34))
+    view.write([Emission(0, 7, np.zeros(4, np.float32), (), np.zeros(0, np.float32), None, False)])
+    view.close(failed=False)
+    console.file.seek(0)
+    assert "7 events" in console.file.read()
+
+
+def test_a_view_of_nothing_closes():
+    TerminalView(terminal(), (34, 34)).close(failed=True)
