@@ -63,9 +63,9 @@ class Cameras:
         """Totals of all cameras, past and present."""
         return _sum([self._past, *(session.stats() for session in list(self._sessions.values()))])
 
-    def stats_of(self, topic: str) -> SessionStats:
-        """What the session of a topic that is served has done."""
-        return self._sessions[topic].stats()
+    def stats_by_topic(self) -> dict[str, SessionStats]:
+        """What the session of each topic that is served has done."""
+        return {topic: session.stats() for topic, session in list(self._sessions.items())}
 
     def process(self, item: StreamItem | Gone) -> Iterator[Emission]:
         """Hand an item to the session of its topic, and yield what is read on the way."""
@@ -87,6 +87,11 @@ class Cameras:
             self._refuse(item.topic, "unusable", str(error))
             self._past = _sum([self._past, session.stats()])
             del self._sessions[item.topic]
+
+    def rest(self) -> None:
+        """Let every camera work ahead."""
+        for session in self._sessions.values():
+            session.rest()
 
     def finish(self) -> Iterator[Emission]:
         """End every stream."""

@@ -8,6 +8,10 @@ each task's own; kernels and decoders release the GIL. Both queues are bounded: 
 fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live source cannot
 make a camera wait: it has an inbox of its own, which says what it does when it is full (`live.inbox`).
 
+A live source also says when nothing more is there. If nothing is under way either, the thread that reads
+processes and writes what it has by itself: there is nobody to work beside, and each hop between threads and
+the loop costs about a tenth of a millisecond, more on a machine that has other things to do.
+
 Ending: when the source is exhausted or `stop` is set, what is in the queues is processed and the sinks are
 closed. When a task fails, the others are cancelled and the sinks are closed as failed.
 """
@@ -40,6 +44,7 @@ Made = TypeVar("Made", covariant=True)
 _QUEUE_ITEMS = 8
 _EVENTS_A_HOP = 32_768
 """Items are handed on in groups of about so many events: a hop between threads costs 50 to 100 us."""
+_ITEMS_A_HOP = 256
 _EMISSIONS_A_HOP = 256
 _PACED_SLICE_US = 10_000
 """Paced packets are cut to this length of the clock, so that nothing waits for the end of a long packet."""
@@ -73,6 +78,9 @@ class Processor(Protocol[Taken, Made]):
     def finish(self) -> Iterator[Made]:
         """The items have ended: yield what is left."""
 
+    def rest(self) -> None:
+        """Nothing waits at the moment: a chance to work ahead, as long as one item takes at most."""
+
 
 class Pipeline(Generic[In, Out]):
     """Runs items through a processor into sinks.
@@ -83,7 +91,8 @@ class Pipeline(Generic[In, Out]):
         processor: what is done with them: a `Session`, for one.
         sinks: written to in this order.
         speed: stream seconds for each second of the clock; None for as fast as possible.
-        on_progress: called on the event loop's thread after each group, with stream time in microseconds.
+        on_progress: called on the event loop's thread after each group that is handed on, with stream time in
+            microseconds.
     """
 
     def __init__(
@@ -104,6 +113,8 @@ class Pipeline(Generic[In, Out]):
         self._inbox: asyncio.Queue[list[In] | None] = asyncio.Queue(_QUEUE_ITEMS)
         self._outbox: asyncio.Queue[list[Out] | None] = asyncio.Queue(_QUEUE_ITEMS)
         self._stop = asyncio.Event()
+        self._has_ended = False
+        self._under_way = 0
         self._stats = PipelineStats()
 
     def stop(self) -> None:
@@ -137,7 +148,11 @@ class Pipeline(Generic[In, Out]):
             groups = _paced_groups(self._items, round(_PACED_SLICE_US * max(self._speed, 1.0)))
         started: tuple[float, int] | None = None
         while not self._stop.is_set():
-            group = await loop.run_in_executor(threads, next, groups, None)
+            try:
+                group = await loop.run_in_executor(threads, self._advance, groups)
+            except asyncio.CancelledError:
+                self._has_ended = True
+                raise
             if group is None:
                 break
             t_us = _stream_time(group)
@@ -145,12 +160,31 @@ class Pipeline(Generic[In, Out]):
                 started = started or (time.monotonic(), t_us)
                 due = started[0] + (t_us - started[1]) / (1e6 * self._speed)
                 await self._sleep_until(due)
+            self._under_way += 1
             await self._inbox.put(group)
             self._stats.items += len(group)
             if t_us is not None:
                 self._on_progress(t_us)
         self._stats.stopped = self._stop.is_set()
         await self._inbox.put(None)
+
+    def _advance(self, groups: "Iterator[_Group[In]]") -> list[In] | None:
+        """In the reader's thread: the next group to hand on. Does by itself what nobody need do beside it."""
+        while not (self._stop.is_set() or self._has_ended):
+            found = next(groups, None)
+            if found is None:
+                return None
+            # Others can only finish what they have: nobody but the reader gives them more.
+            if found.items and (found.more or self._under_way):
+                return found.items
+            emissions = self._emissions(found.items)
+            while part := _take(emissions):
+                for sink in self._sinks:
+                    sink.write(part)
+            self._stats.items += len(found.items)
+            if not self._under_way:
+                self._processor.rest()
+        return None
 
     async def _sleep_until(self, due: float) -> None:
         wait = due - time.monotonic()
@@ -172,8 +206,10 @@ class Pipeline(Generic[In, Out]):
             while full:
                 part = await loop.run_in_executor(threads, _take, emissions)
                 if part:
+                    self._under_way += 1
                     await self._outbox.put(part)
                 full = len(part) == _EMISSIONS_A_HOP
+            self._under_way -= 1
         await self._outbox.put(None)
 
     def _emissions(self, group: list[In] | None) -> Iterator[Out]:
@@ -188,6 +224,7 @@ class Pipeline(Generic[In, Out]):
         while (part := await self._outbox.get()) is not None:
             for sink in self._sinks:
                 await loop.run_in_executor(threads, sink.write, part)
+            self._under_way -= 1
 
 
 def run_until_interrupted(
@@ -246,32 +283,40 @@ def _take(emissions: Iterator[Out]) -> list[Out]:
     return list(islice(emissions, _EMISSIONS_A_HOP))
 
 
-def _full_groups(items: Iterable[In | None]) -> Iterator[list[In]]:
+@dataclass(slots=True)
+class _Group(Generic[In]):
+    """Items that go together, none if there are none at the moment; `more` may be there already."""
+
+    items: list[In]
+    more: bool = True
+
+
+def _full_groups(items: Iterable[In | None]) -> Iterator[_Group[In]]:
     group: list[In] = []
     events = 0
     for item in items:
         if item is not None:
             group.append(item)
             events += len(item.events) if isinstance(item, Packet) else 0
-        if events >= _EVENTS_A_HOP or (item is None and group):
-            yield group
+        if item is None or events >= _EVENTS_A_HOP or len(group) == _ITEMS_A_HOP:
+            yield _Group(group, more=item is not None)
             group, events = [], 0
     if group:
-        yield group
+        yield _Group(group)
 
 
-def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[list[In]]:
+def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[_Group[In]]:
     for item in items:
         if item is None:
             continue
         if not isinstance(item, Packet) or len(item.events) == 0:
-            yield [item]
+            yield _Group([item])
             continue
         latest = np.maximum.accumulate(item.events["t"])
         start = 0
         while start < len(latest):
             stop = int(np.searchsorted(latest, latest[start] + slice_us))
-            yield [replace(item, events=item.events[start:stop])]
+            yield _Group([replace(item, events=item.events[start:stop])])
             start = stop
 
 

@@ -26,6 +26,9 @@ StreamItem = Packet | Label | Tick
 _TRACE = 32
 """Events whose features are held at a time under `event`."""
 
+_REST_COLUMNS = 4096
+"""Operator columns that are added at most while nothing waits: a fraction of a millisecond."""
+
 _AUTO_REST = 4.0
 """Under `auto`, time that passes after a reading, in multiples of what that reading took."""
 
@@ -172,6 +175,11 @@ class Session:
         if end < len(events):
             yield from self._finish_sample()
             yield from self._feed(engine, events[end:], latest[end:])
+
+    def rest(self) -> None:
+        """Nothing waits: bring the engine up to date, so that a reading that is due later costs less then."""
+        if self._engine and (self._unread or self._every_event) and self.policy.kind != "auto":
+            self._engine.prepare(_REST_COLUMNS)
 
     def finish(self) -> Iterator[Emission]:
         """End the stream: the open sample is read, and what was collected is learned."""

@@ -10,6 +10,9 @@ from contextlib import contextmanager
 
 import zenoh
 
+from streamfeat.live.listen import Listen
+from streamfeat.live.names import PlainNames
+
 PATIENCE_S = float(os.environ.get("LIVE_PATIENCE_S", "120"))
 """Kernels may have to be compiled first, on a machine that has other things to do."""
 
@@ -77,6 +80,13 @@ def until_heard(session, key, *jobs):
 def attachment(seq, gid=b"0123456789abcdef", source_ns=0):
     """33 bytes as the design document of rmw_zenoh has them."""
     return struct.pack("<q", seq) + struct.pack("<q", source_ns) + bytes([16]) + gid
+
+
+def compiled(folder):
+    """Compile what listening needs, before anybody waits for anything; processes find it in numba's cache."""
+    for emit in ("event", "10ms"):
+        Listen(PlainNames("x"), folder / "model", emit=emit)._warm_up()
+    return folder
 
 
 class Collector:

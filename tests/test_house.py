@@ -53,6 +53,7 @@ ROOMS = {
         {"clock", "delivery", "inbox", "names"},
         {"intake"},
         {"health", "network", "publisher"},
+        {"screen"},
         {"listen", "publish", "record"},
     ],
     "evaluate": [

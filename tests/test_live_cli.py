@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import tiny
-from live_net import attachment, free_port, plain_publisher, plain_session, running, until
+from live_net import attachment, compiled, free_port, plain_publisher, plain_session, running, until
 from test_live_listen import CLASSIFIER, MODEL, batches, message
 
 from streamfeat.cli import main
@@ -43,7 +43,7 @@ def files(tmp_path_factory):
     MODEL.save(folder / "model")
     CLASSIFIER.save(folder / "classifier")
     tiny.write_items(folder / "labelled.mcap", tiny.labelled_items(3))
-    return folder
+    return compiled(folder)
 
 
 def test_listen_ends_well_when_interrupted(files, tmp_path):

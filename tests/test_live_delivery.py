@@ -89,6 +89,20 @@ def test_a_publisher_whose_predecessor_left_need_not_wait():
     assert delivery.stats == DeliveryStats(received=5, foreign=1, restarts=1)
 
 
+def test_word_of_leaving_may_overtake_everything():
+    """However early, whoever comes next is followed at once, and two who stay do not take turns."""
+    delivery = Delivery()
+    delivery.announced(here=False)
+    assert not delivery.see(ONE, 1, 0).anew
+    for now, gid in enumerate((TWO, ONE, TWO), 1):
+        delivery.announced(here=True)
+        delivery.announced(here=False)
+        assert delivery.see(gid, 1, now).anew
+    delivery.announced(here=True)
+    assert delivery.see(ONE, 1, 5).anew
+    assert delivery.see(TWO, 2, 6).foreign
+
+
 def test_a_publisher_that_was_cut_off_and_is_back_stays():
     delivery, _ = feed([1, 2, 3])
     delivery.announced(here=False)

@@ -1,7 +1,9 @@
 """Listening on real zenoh sessions over loopback: what arrives, what is published, what goes wrong."""
 
+import io
 import json
 import os
+import re
 import time
 import urllib.request
 
@@ -14,6 +16,7 @@ from live_net import (
     Collector,
     ListSink,
     attachment,
+    compiled,
     free_port,
     plain_publisher,
     plain_session,
@@ -21,6 +24,7 @@ from live_net import (
     until,
     until_heard,
 )
+from rich.console import Console
 
 from streamfeat.codecs import encode
 from streamfeat.emission import EmitPolicy
@@ -30,6 +34,7 @@ from streamfeat.live.listen import Listen
 from streamfeat.live.names import PlainNames
 from streamfeat.live.publish import Publish
 from streamfeat.live.record import Record
+from streamfeat.live.screen import HealthTable
 from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.recording import open_recording
 from streamfeat.session import Session
@@ -46,7 +51,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     MODEL.save(folder / "model")
     CLASSIFIER.save(folder / "classifier")
-    return folder
+    return compiled(folder)
 
 
 def listener(files, expression="cam/*/events", classifier=True, **options):
@@ -197,14 +202,14 @@ def test_word_that_a_camera_leaves_may_overtake_its_last_packets(files, monkeypa
             token = net.liveliness().declare_token(f"{key}/@events/{gid.hex()}")
             camera.put(message(sent[0], 0), attachment=attachment(1, gid))
             token.undeclare()
-            until(lambda: key in job._intake._leaving)
+            until(lambda: key in job._intake._leaving, "word of leaving")
             for i, events in enumerate(sent[1:], 1):
                 camera.put(message(events, i), attachment=attachment(i + 1, gid))
             # The next one need not wait until this one is released, and begins anew.
-            until(lambda life=life: job.result()["packets"] == 12 * (life + 1))
+            until(lambda life=life: job.result()["packets"] == 12 * (life + 1), lambda: f"{job.result()}")
         assert job._cameras.topics == [key]
         monkeypatch.setattr(intake, "GRACE_S", 0.0)
-        until(lambda: job._cameras.topics == [])
+        until(lambda: job._cameras.topics == [], lambda: f"nobody, {vars(job._intake)}")
     packets = [tiny.packet(events) for events in sent]
     for life in (sink.emissions[:12], sink.emissions[12:]):
         same(life, replayed(packets))
@@ -519,6 +524,52 @@ def test_metrics_tell_what_the_summary_tells(files):
     assert {'streamfeat_queue_depth{queue="inbox_messages"}', "streamfeat_cameras"} <= set(values)
     assert 0 < result["end_to_end_p50_ms"] <= result["end_to_end_p99_ms"]
     json.dumps(result)
+
+
+class Terminal(io.StringIO):
+    """Notes what a terminal would be sent."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_one_table_of_the_figures_of_the_metrics(files):
+    port, terminal = free_port(), Terminal()
+    console = Console(file=terminal, width=120, height=40, force_terminal=True, color_system=None)
+    job = listener(files, emit="10ms", port=port)
+    with (
+        plain_session(port, listen=True) as net,
+        running(job, console=console),
+        plain_publisher(net, "cam/a/events") as camera,
+    ):
+        for i, events in enumerate(batches(20)):
+            if i != 7:
+                camera.put(message(events, i), attachment=attachment(i + 1, source_ns=time.time_ns()))
+        camera.put(b"", attachment=attachment(21))
+        until(lambda: job.result()["emissions"] >= 18 and job.result()["warnings"].get("bad packet"))
+        until(lambda: "cam/a/events" in terminal.getvalue(), "the table")
+        plain = Console(file=io.StringIO(), width=120)
+        plain.print(HealthTable(job.health))
+        shown = plain.file.getvalue()
+        for name, value, _ in job.health.figures():
+            assert re.search(rf"{name.replace('_', ' ')} +{value:,}( |\n)", shown), name
+        assert {name for name, *_ in job.health.figures()} >= {"events", "lost_packets", "late_events"}
+        assert re.search(r"cam/a/events +3,800 +1[89] +1 +0\.\d\d s +(cat|dog|owl)", shown)
+        for what in ("update p50", "end to end p99"):
+            assert re.search(rf"{what} +[0-9.]+ ms", shown)
+        assert "bad packet 1, packets missing 1" in shown
+    # Not a terminal: a line a second, and no table.
+    text = io.StringIO()
+    with (
+        plain_session(port := free_port(), listen=True) as net,
+        running(listener(files, emit="10ms", port=port), console=Console(file=text, width=120)),
+        plain_publisher(net, "cam/a/events") as camera,
+    ):
+        for i, events in enumerate(batches(3)):
+            camera.put(message(events, i), attachment=attachment(i + 1))
+        until(text.getvalue, "a line")
+    assert text.getvalue().count("\n") == 1
+    assert "cam/a/events" in text.getvalue()
 
 
 def test_what_cannot_work_is_said_at_once(files, tmp_path):

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import tiny
-from live_net import Collector, ListSink, free_port, plain_session, running, until
+from live_net import Collector, ListSink, compiled, free_port, plain_session, running, until
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory  # an independent reader of CDR
 
@@ -46,9 +46,9 @@ def cdr(events, seq, time_base_ns):
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("models") / "model"
-    MODEL.save(path)
-    return path
+    folder = tmp_path_factory.mktemp("models")
+    MODEL.save(folder / "model")
+    return compiled(folder) / "model"
 
 
 def test_listening_to_a_ros_camera(model):

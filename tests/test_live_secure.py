@@ -11,7 +11,7 @@ import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from live_net import Collector, attachment, free_port, running, until
+from live_net import Collector, attachment, compiled, free_port, running, until
 from test_live_listen import MODEL, message
 
 from streamfeat.live.listen import Listen
@@ -100,7 +100,7 @@ def folder(tmp_path_factory):
     (folder / "other").mkdir()
     Authority(folder / "other").issue("camera")
     MODEL.save(folder / "model")
-    return folder
+    return compiled(folder)
 
 
 def client(port, folder, name, authority=None, *, timeout_s=60):

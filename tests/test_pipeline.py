@@ -133,6 +133,69 @@ def test_what_is_there_does_not_wait_for_what_is_not():
     assert [e.t_us for e in sink.emissions[:2]] == [10_000, 20_000]
 
 
+def live_source(packets, waits):
+    """Packets one by one, as a camera gives them; `waits` says after which more is there already."""
+    for packet, more in zip(packets, waits, strict=True):
+        yield packet
+        if not more:
+            yield None
+            yield None
+
+
+@pytest.mark.parametrize("policy", ["event", "10ms", "1000ev"])
+def test_what_nobody_need_do_beside_is_done_in_one_thread_and_is_the_same(policy):
+    packets = [tiny.packet(tiny.steady(i * 5_000, (i + 1) * 5_000, 300, seed=i)) for i in range(60)]
+    expected, _ = plain_loop(packets, policy)
+    waits = np.random.default_rng(0).random(60) < 0.5
+
+    class Resting(Session):
+        rests = 0
+
+        def rest(self):
+            super().rest()
+            self.rests += 1
+
+    sink, one = ListSink(), Resting(MODEL, EmitPolicy.parse(policy), CLASSIFIER)
+    pipeline = Pipeline(live_source(packets, waits), one, [sink])
+    asyncio.run(pipeline.run())
+    same(sink.emissions, expected)
+    assert pipeline.stats().items == 60
+    assert one.rests > 0
+
+
+def test_a_sink_that_fails_in_the_reader_ends_everything():
+    sink = BrokenSink()
+
+    def source():
+        while True:
+            yield tiny.packet(tiny.steady(0, 50_000, 100))
+            yield None
+
+    with pytest.raises(OSError, match="no room"):
+        asyncio.run(Pipeline(source(), session(), [sink]).run())
+    assert sink.closed == "failed"
+
+
+def test_a_live_source_that_says_nothing_can_be_left():
+    """Nothing comes and nothing is said but that: whoever is cancelled need not wait for a packet."""
+    asked, sink = threading.Event(), ListSink()
+
+    def source():
+        while True:
+            asked.set()
+            yield None
+
+    async def run():
+        task = asyncio.create_task(Pipeline(source(), session(), [sink]).run())
+        await until(asked.is_set)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    assert sink.closed == "failed"
+
+
 @pytest.mark.parametrize("own", [True, False])
 def test_pipelines_side_by_side_end_well_on_a_signal(own):
     read, sinks = [[], []], [ListSink(), ListSink()]

@@ -79,6 +79,7 @@ class Delivery:
         self._other: bytes | None = None
         self._heard_ns = 0
         self._is_announced = True
+        self._has_come = False
         self._have_left = False
         self._next = 0
         self._missing: dict[int, None] = {}
@@ -121,6 +122,7 @@ class Delivery:
     def announced(self, *, here: bool) -> None:
         """The first publisher has come, or the last has left: whoever comes next takes over at once."""
         self._is_announced = here
+        self._has_come |= here
         self._have_left |= not here
 
     def _counts_anew(self, seq: int) -> bool:
@@ -137,7 +139,10 @@ class Delivery:
         # Publishers count from 1, so of one that is new here the numbers before are missing.
         known = first or not gid or gid in (self._gid, self._other) or not 0 < seq <= _REMEMBERED
         lost = 0 if known else max(seq - 1 - dropped, 0)
-        anew, self._have_left = self._have_left and not first, False
+        anew = self._have_left and not first
+        # Word that this one came and left may have overtaken all that it sent.
+        self._have_left &= not self._is_announced and (first or self._has_come)
+        self._has_come = False
         self._gid, self._heard_ns, self._next = gid, now_ns, seq + 1
         self._missing.clear()
         self._old.clear()

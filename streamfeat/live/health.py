@@ -7,6 +7,7 @@ Not here: counting itself, which each part does for its own work.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 from wsgiref.simple_server import WSGIServer
 
@@ -22,10 +23,56 @@ from streamfeat.live.intake import Intake, Warnings
 from streamfeat.pipeline import PipelineStats
 from streamfeat.session import StreamItem
 
-__all__ = ["Health", "parse_address"]
+__all__ = ["CameraFigures", "Health", "parse_address"]
 
 _BUCKETS = tuple(scale * base for scale in (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0) for base in (1, 2, 5))
 _KEPT = 65_536
+_SHARES = {"p50": 0.5, "p99": 0.99}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """How one camera is doing.
+
+    Attributes:
+        topic: of the camera.
+        events: accepted.
+        emissions: readings made.
+        lost: packets that never arrived or were dropped.
+        t_us: stream time of the latest reading; None before the first.
+        prediction: of that reading; None without a classifier.
+    """
+
+    topic: str
+    events: int
+    emissions: int
+    lost: int
+    t_us: int | None
+    prediction: str | None
+
+
+class _Latest:
+    """The latest so many values, so that a run of any length has an end."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+        self._n = 0
+
+    def add(self, value: float) -> None:
+        if len(self._values) < _KEPT:
+            self._values.append(value)
+        else:
+            self._values[self._n % _KEPT] = value
+        self._n += 1
+
+    def percentiles(self) -> list[tuple[str, float]]:
+        ordered = sorted(self._values)
+        if not ordered:
+            return []
+        return [
+            (name, ordered[min(int(share * len(ordered)), len(ordered) - 1)])
+            for name, share in _SHARES.items()
+        ]
 
 
 class Health:
@@ -63,8 +110,8 @@ class Health:
             registry=self.registry,
             buckets=_BUCKETS,
         )
-        self._latencies: list[float] = []
-        self._n_latencies = 0
+        self._latest_update, self._latest_end_to_end = _Latest(), _Latest()
+        self._latest: dict[str, Emission] = {}
         self.registry.register(self)
 
     def process(self, item: StreamItem | Gone) -> Iterator[Emission]:
@@ -77,8 +124,16 @@ class Health:
             spent += time.perf_counter() - started
             if emission is None:
                 break
+            self._latest[emission.topic] = emission
             yield emission
         self._update.observe(spent)
+        self._latest_update.add(spent)
+        if isinstance(item, Gone):
+            self._latest.pop(item.topic, None)
+
+    def rest(self) -> None:
+        """Let the cameras work ahead."""
+        self._cameras.rest()
 
     def finish(self) -> Iterator[Emission]:
         """End the cameras' streams."""
@@ -89,12 +144,7 @@ class Health:
         if source_ns:
             seconds = (now_ns - source_ns) / 1e9
             self._end_to_end.observe(seconds)
-            # The latest ones, so that a run of any length has an end.
-            if len(self._latencies) < _KEPT:
-                self._latencies.append(seconds)
-            else:
-                self._latencies[self._n_latencies % _KEPT] = seconds
-            self._n_latencies += 1
+            self._latest_end_to_end.add(seconds)
 
     def serve(self, host: str, port: int) -> int:
         """Serve the metrics over HTTP in a thread of its own; gives the port.
@@ -118,10 +168,10 @@ class Health:
         """Totals of all topics that are or were followed."""
         return self._intake.delivery()
 
-    def collect(self) -> Iterable[Metric]:
-        """Everything that is counted elsewhere, for Prometheus."""
+    def figures(self) -> list[tuple[str, int, str]]:
+        """Everything that is counted: name, value, and what it means."""
         stats, delivery = self._cameras.stats(), self.delivery()
-        for name, value, text in (
+        return [
             ("events", stats.events, "Events accepted"),
             ("late_events", stats.late, "Events older than the window"),
             ("rejected_events", stats.rejected, "Events outside the sensor or malformed"),
@@ -135,17 +185,46 @@ class Health:
             ("reordered_packets", delivery.reordered, "Packets that arrived late"),
             ("foreign_packets", delivery.foreign, "Packets of a second publisher on the same key"),
             ("publisher_restarts", delivery.restarts, "Publishers that took over or counted anew"),
-        ):
+        ]
+
+    def depths(self) -> list[tuple[str, int]]:
+        """What waits in each queue."""
+        pipeline = self.queues()
+        return [
+            ("inbox_messages", self._inbox.depth),
+            ("session_groups", pipeline.queued_in),
+            ("sink_groups", pipeline.queued_out),
+        ]
+
+    def latencies(self) -> list[tuple[str, list[tuple[str, float]]]]:
+        """Seconds at some percentiles, of the latest updates and of the latest published features."""
+        return [
+            ("update", self._latest_update.percentiles()),
+            ("end to end", self._latest_end_to_end.percentiles()),
+        ]
+
+    def cameras(self) -> list[CameraFigures]:
+        """Each camera that is served, in order of appearance."""
+        found = []
+        for topic, stats in self._cameras.stats_by_topic().items():
+            state, latest = self._intake.topics.get(topic), self._latest.get(topic)
+            delivery = state.delivery.stats if state else DeliveryStats()
+            lost, t_us = delivery.lost + delivery.dropped, latest.t_us if latest else None
+            prediction = latest.prediction if latest else None
+            found.append(CameraFigures(topic, stats.events, stats.emissions, lost, t_us, prediction))
+        return found
+
+    def collect(self) -> Iterable[Metric]:
+        """Everything that is counted elsewhere, for Prometheus."""
+        for name, value, text in self.figures():
             yield CounterMetricFamily(f"streamfeat_{name}", text, value=value)
         refused = CounterMetricFamily("streamfeat_warnings", "What was refused or strange", labels=["reason"])
-        for reason, count in sorted(self._reasons().items()):
+        for reason, count in sorted(self.reasons().items()):
             refused.add_metric([reason], count)
         yield refused
-        pipeline = self.queues()
         depth = GaugeMetricFamily("streamfeat_queue_depth", "What waits in each queue", labels=["queue"])
-        depth.add_metric(["inbox_messages"], self._inbox.depth)
-        depth.add_metric(["session_groups"], pipeline.queued_in)
-        depth.add_metric(["sink_groups"], pipeline.queued_out)
+        for name, waiting in self.depths():
+            depth.add_metric([name], waiting)
         yield depth
         yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
 
@@ -176,20 +255,15 @@ class Health:
             "foreign": delivery.foreign,
             "late": stats.late,
             "rejected": stats.rejected,
-            "warnings": dict(sorted(self._reasons().items())),
+            "warnings": dict(sorted(self.reasons().items())),
         }
-        if self._latencies:
-            ordered = sorted(self._latencies)
-            for name, share in (("p50", 0.5), ("p99", 0.99)):
-                result[f"end_to_end_{name}_ms"] = round(1e3 * _at(ordered, share), 3)
+        for name, seconds in self._latest_end_to_end.percentiles():
+            result[f"end_to_end_{name}_ms"] = round(1e3 * seconds, 3)
         return result
 
-    def _reasons(self) -> Counter[str]:
+    def reasons(self) -> Counter[str]:
+        """What was refused or strange, by reason."""
         return Counter(dict(list(self._warnings.counts.items())))
-
-
-def _at(ordered: list[float], share: float) -> float:
-    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
 
 
 def parse_address(text: str) -> tuple[str, int]:

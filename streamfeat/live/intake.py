@@ -150,10 +150,10 @@ class Intake:
             passed_s = min(now - looked, 2 * _POLL_S)
             yield from self._silences(passed_s)
             # Nor does that of those who leave begin before all that had arrived was looked at.
+            looked = now
             if not self._inbox.depth:
                 yield from self._releases(passed_s)
-            looked = now
-            yield None
+                yield None
 
     def delivery(self) -> DeliveryStats:
         """Totals of all topics, past and present; may be called from another thread."""
@@ -327,7 +327,9 @@ class Intake:
             self._past = self._past + self.topics.pop(oldest).delivery.stats
             yield Gone(oldest)
         reader = PacketReader(topic, MAX_PACKET_EVENTS)
-        self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
+        state = self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
+        if topic in self._leaving:
+            state.delivery.announced(here=False)
 
     def _silences(self, passed_s: float) -> Iterator[Tick]:
         for topic, state in self.topics.items():

@@ -5,11 +5,14 @@ Not here: each of the parts.
 """
 
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
+from rich.live import Live
 
 from streamfeat.cameras import Cameras, Gone
 from streamfeat.classifier import Classifier
@@ -24,6 +27,7 @@ from streamfeat.live.intake import SILENCE_S, Intake, Warnings
 from streamfeat.live.names import Names, beside
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.publisher import OutputSink
+from streamfeat.live.screen import HealthTable
 from streamfeat.packets import Packet
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
@@ -34,10 +38,9 @@ __all__ = ["Listen"]
 
 PATIENCE_S = 0.05
 """A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
-
-
 MAX_DELAY_S = 1.0
 """Where even feeding cannot keep up, packets are dropped rather than being ever further behind."""
+_DRAWN_A_SECOND = 4
 
 
 class Listen:
@@ -112,7 +115,7 @@ class Listen:
         """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
 
         Args:
-            console: for live lines.
+            console: for a table that is kept up to date if it is a terminal, or else for lines.
             recording_out: MCAP file for features and predictions; replaced if it exists.
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
@@ -122,10 +125,20 @@ class Listen:
             InputError: an output, the network or the metrics address cannot be used.
         """
         self._warm_up()
-        with open_session(self._zenoh_config, port=self._port) as session:
+        is_screen = console is not None and console.is_terminal
+        screen = Live(
+            get_renderable=lambda: HealthTable(self.health),
+            console=console,
+            refresh_per_second=_DRAWN_A_SECOND,
+            transient=True,
+        )
+        with (
+            open_session(self._zenoh_config, port=self._port) as session,
+            screen if is_screen else nullcontext(),
+        ):
             sinks = open_sinks(
                 partial(OutputSink, session, self._names, self.health.on_published),
-                partial(TerminalSink, console) if console else None,
+                partial(TerminalSink, console) if console and not is_screen else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
                 (lambda: more) if more else None,
@@ -156,15 +169,16 @@ class Listen:
         for encoding in ENCODINGS:
             payload, base_ns = encode(event, encoding)
             make_decoder(encoding).decode(payload, base_ns)
-        # One in time and one too late: the two ways to feed.
-        for log_time_ns in (time.time_ns(), 0):
-            session = self._make_session("")
-            for _ in session.process(Packet("", event, (side, side), log_time_ns, 0)):
+        # In time and too late, however long compiling takes: the two ways to feed.
+        for is_late in (False, True):
+            session = self._make_session("", lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
+            for _ in session.process(Packet("", event, (side, side), 0, 0)):
                 pass
+            session.rest()
             for _ in session.finish():
                 pass
 
-    def _make_session(self, topic: str) -> Session:
+    def _make_session(self, topic: str, is_behind: Callable[[int], bool] | None = None) -> Session:
         return Session(
             self._encoder,
             self._policy,
@@ -172,8 +186,11 @@ class Listen:
             learn_online=self._learn_online,
             clock=time.perf_counter,
             topic=topic,
-            is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > self._patience_ns,
+            is_behind=is_behind or self._is_behind,
         )
+
+    def _is_behind(self, log_time_ns: int) -> bool:
+        return time.time_ns() - log_time_ns > self._patience_ns
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
         self._warnings.add(reason, topic, error)

@@ -124,7 +124,7 @@ class Subscription:
         """
         self._names = names
         self._inbox = inbox
-        self._publishers: Counter[str] = Counter()
+        self._tokens: dict[str, set[str]] = {}
         self._open: list[object] = []
         try:
             # First the tokens: who leaves was there before.
@@ -205,14 +205,16 @@ class Subscription:
         topic = self._names.token_topic(str(sample.key_expr))
         if not topic:
             return
+        # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
+        tokens = self._tokens.setdefault(topic, set())
         if sample.kind == zenoh.SampleKind.PUT:
-            self._publishers[topic] += 1
-            if self._publishers[topic] == 1:
+            tokens.add(str(sample.key_expr))
+            if len(tokens) == 1:
                 self._inbox.put(Announcement(topic, here=True))
             return
-        self._publishers[topic] -= 1
-        if self._publishers[topic] <= 0:
-            del self._publishers[topic]
+        tokens.discard(str(sample.key_expr))
+        if not tokens:
+            del self._tokens[topic]
             self._inbox.put(Announcement(topic, here=False))
 
 

@@ -127,6 +127,9 @@ class _Cutter:
     def finish(self) -> Iterator[EventPacket | LabelMessage]:
         yield from ()
 
+    def rest(self) -> None:
+        pass
+
 
 def _items(recording: Recording, *, loop: bool) -> Iterator[Packet | Label]:
     yield from recording.items()

@@ -144,7 +144,8 @@ class Record:
             if time.monotonic() >= due:
                 due = time.monotonic() + self._chunk_s
                 yield _Flush()
-            yield None
+            if not self._inbox.depth:
+                yield None
 
     def _is_wanted(self, message: RawMessage) -> bool:
         """Whether it is a message of ours that did not come before; says what is missing."""
@@ -180,6 +181,9 @@ class _Unchanged:
 
     def finish(self) -> Iterator[RawMessage | _Flush]:
         yield from ()
+
+    def rest(self) -> None:
+        pass
 
 
 class _MessageSink:
