@@ -17,8 +17,8 @@ from streamfeat.classifier import Classifier, train_classifier
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.features import encode_samples
-from streamfeat.geometry import Geometry
 from streamfeat.learn.fit import learn_encoder
+from streamfeat.learn.setting import Setting
 from streamfeat.packets import Packet
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
@@ -38,8 +38,7 @@ SIZES = {"train": 200, "test": 40}
 
 _SAMPLE_US, _GAP_US = 300_000, 300_000
 """A sample is three saccades; the silence after it is one window."""
-_GEOMETRY = Geometry(patch=10, stride=2, n_bins=3, bin_us=100_000, max_count=2)
-_FILTERS, _VOLUMES, _ITERATIONS = 64, 4_000, 6
+_SETTING = Setting(patch=10, max_count=2, window_ms=300, filters=64, volumes=4_000, iterations=6)
 _SPEED = 3.0
 """Stream seconds for each second of the live view: its forty digits take eight."""
 
@@ -84,14 +83,7 @@ class Demo:
             KeyboardInterrupt: Ctrl-C, as anywhere else; here it would only end the learning.
         """
         with open_recording(self.train) as recording:
-            encoder = learn_encoder(
-                [recording],
-                _GEOMETRY,
-                n_filters=_FILTERS,
-                n_volumes=_VOLUMES,
-                max_iter=_ITERATIONS,
-                report=self._report,
-            )
+            encoder = learn_encoder([recording], _SETTING, report=self._report)
         if encoder.provenance["interrupted"]:
             raise KeyboardInterrupt
         encoder.save(self.model)
@@ -165,3 +157,6 @@ class _Watched:
 
     def finish(self) -> Iterator[Emission]:
         return self._session.finish()
+
+    def rest(self) -> None:
+        self._session.rest()
