@@ -11,7 +11,8 @@ volumes. Ours is what the learner reports, with the codes it has; scikit-learn's
 to a gap of 1e-6, which its time does not count. Passes that were not made in full are scaled to be.
 
 With --scaled-to there is no objective, and times are scaled to passes over so many volumes: scikit-learn's by
-its batches, ours by what a quarter of the volumes took less, since the step after a pass does not grow.
+its batches, ours by what half of the volumes (no fewer than K) took less, as the step after a pass does not
+grow.
 Seconds are of the processor, over all threads, and by the clock.
 """
 
@@ -62,13 +63,13 @@ def timed_iterations(learner: TransformLearner | DictionaryLearner, white: np.nd
 
 
 def scaled(learner: TransformLearner | DictionaryLearner, white: np.ndarray, total: int) -> np.ndarray:
-    """Seconds of the processor and by the clock for `total` volumes, from `white` and a quarter of it."""
+    """Seconds of the processor and by the clock for `total` volumes, from `white` and half of it."""
     spent = []
-    for rows in (white[: len(white) // 4], white):
+    for rows in (white[: len(white) // 2], white):
         began = np.array([time.process_time(), time.perf_counter()])
         clone(learner).fit(rows)
         spent.append(np.array([time.process_time(), time.perf_counter()]) - began)
-    each = (spent[1] - spent[0]) / (len(white) - len(white) // 4)
+    each = (spent[1] - spent[0]) / (len(white) - len(white) // 2)
     return spent[1] + each * (total - len(white))
 
 

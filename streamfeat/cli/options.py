@@ -38,9 +38,7 @@ def _shown(name: str) -> str:
     return str((DEFAULTS | PRESETS["default"])[name])
 
 
-Preset = Annotated[
-    str, typer.Option(help=f"Values of all options that are not given: {', '.join(PRESETS)}.")
-]
+Preset = Annotated[str, typer.Option(help=f"Values of all options that are not given: {', '.join(PRESETS)}.")]
 Encoding = Annotated[
     str | None,
     typer.Option(help="What is pooled: soft, split or triangle.", show_default=_shown("encoding")),
