@@ -191,8 +191,6 @@ def train_classifier(
 ) -> Classifier:
     """Train a linear SVM; its regularisation is chosen by stratified cross-validation.
 
-    Normalisation and standardisation do not look at labels; they are those of all samples in every fold.
-
     Args:
         features: `(n, F)` float32, as `Encoder.encode` gives them; not changed.
         labels: `n` names.
@@ -226,22 +224,24 @@ def train_classifier(
             f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
             f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
         )
-    scaler = StandardScaler(copy=False)
-    rows = scaler.fit_transform(normalise_features(features))
+    rows = normalise_features(features)
     splitter = StratifiedGroupKFold(folds, shuffle=True, random_state=seed)
-    parts = list(splitter.split(rows, targets, group))
-    machines = [LinearSVM(warm_start=True) for _ in parts]
+    parts = [
+        (train, test, StandardScaler().fit(rows[train]), LinearSVM(warm_start=True))
+        for train, test in splitter.split(rows, targets, group)
+    ]
 
     def score(c: float) -> float:
         right = 0
-        for svm, (train, test) in zip(machines, parts, strict=True):
-            svm.set_params(C=c).fit(rows[train], targets[train])
-            right += int(np.sum(svm.predict(rows[test]) == targets[test]))
+        for train, test, fold_scaler, svm in parts:
+            svm.set_params(C=c).fit(fold_scaler.transform(rows[train]), targets[train])
+            right += int(np.sum(svm.predict(fold_scaler.transform(rows[test])) == targets[test]))
         return right / len(targets)
 
     scores = {c: score(c) for c in candidates} if candidates else _climb(score, len(targets))
     best = max(scores, key=lambda c: (scores[c], -c))
-    svm = LinearSVM(C=best).fit(rows, targets)
+    scaler = StandardScaler(copy=False)
+    svm = LinearSVM(C=best).fit(scaler.fit_transform(rows), targets)
     return Classifier(
         labels=tuple(str(name) for name in svm.classes_),
         centre=scaler.mean_.astype(np.float32),

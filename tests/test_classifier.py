@@ -11,6 +11,9 @@ import tiny
 from safetensors.numpy import load_file, save_file
 from scipy.optimize import check_grad, minimize
 from sklearn.datasets import make_blobs
+from sklearn.model_selection import StratifiedGroupKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import LinearSVC
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
@@ -257,6 +260,25 @@ def test_train_classifier(tmp_path, n_classes):
     assert clf.provenance["samples"] == 60
     clf.save(tmp_path / "clf")
     assert np.allclose(Classifier.load(tmp_path / "clf").scores(fresh), clf.scores(fresh), atol=1e-4)
+
+
+def test_cross_validation_is_that_of_a_pipeline():
+    features, labels = toy_features(90, 3)
+    features += np.random.default_rng(1).gamma(1.0, 6.0, features.shape).astype(np.float32)
+    candidates, groups = (1e-4, 1e-2), np.arange(90) // 2
+    trained = train_classifier(features, labels, MODEL, groups=groups, candidates=candidates)
+    folds = StratifiedGroupKFold(3, shuffle=True, random_state=0).split(features, labels, groups)
+    right = dict.fromkeys(candidates, 0)
+    for train, test in folds:
+        for c in candidates:
+            pipeline = make_pipeline(
+                FunctionTransformer(normalise_features), StandardScaler(), LinearSVM(C=c)
+            )
+            pipeline.fit(features[train], np.array(labels)[train])
+            right[c] += np.sum(pipeline.predict(features[test]) == np.array(labels)[test])
+    found = trained.provenance["cross_validation"]
+    assert found == {str(c): pytest.approx(right[c] / 90, abs=0.012) for c in candidates}
+    assert min(found.values()) < 1
 
 
 def test_c_is_looked_for_until_the_best_has_neighbours():

@@ -3,11 +3,17 @@
 Lives here: the same volumes, threshold and threads for all, the objective against time, time at equal passes.
 
     python tools/compare_learners.py ncars.mcap
-    python tools/compare_learners.py ncars.mcap --filters 1700 --bins 7 --volumes 4000 --passes 2 --batches 1
+    python tools/compare_learners.py ncars.mcap --filters 1700 --bins 7 --volumes 4000 --passes 2 \\
+        --batches 1 --scaled-to 100000
 
 The objective is that of the inverse problem without penalty, `1/2 |x - D l|^2 + lambda0 |l|_1`, a mean over
 volumes. Ours is what the learner reports, with the codes it has; scikit-learn's dictionaries get codes solved
 to a gap of 1e-6, which its time does not count. Passes that were not made in full are scaled to be.
+
+With --scaled-to there is no objective, and times are scaled to passes over so many volumes: scikit-learn's by
+its batches, ours by what half of the volumes (no fewer than K) took less, as the step after a pass does not
+grow.
+Seconds are of the processor, over all threads, and by the clock.
 """
 
 import argparse
@@ -56,6 +62,17 @@ def timed_iterations(learner: TransformLearner | DictionaryLearner, white: np.nd
     return curve
 
 
+def scaled(learner: TransformLearner | DictionaryLearner, white: np.ndarray, total: int) -> np.ndarray:
+    """Seconds of the processor and by the clock for `total` volumes, from `white` and half of it."""
+    spent = []
+    for rows in (white[: len(white) // 2], white):
+        began = np.array([time.process_time(), time.perf_counter()])
+        clone(learner).fit(rows)
+        spent.append(np.array([time.process_time(), time.perf_counter()]) - began)
+    each = (spent[1] - spent[0]) / (len(white) - len(white) // 2)
+    return spent[1] + each * (total - len(white))
+
+
 def batches(n: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Indices of batches, pass after pass, each in another order."""
     while True:
@@ -64,23 +81,25 @@ def batches(n: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]
 
 
 def timed_batches(
-    learner: MiniBatchDictionaryLearning, white: np.ndarray, most: int, seconds: float
-) -> Curve:
-    """Learn batch after batch, until there are enough of them or time is up; look at about ten."""
+    learner: MiniBatchDictionaryLearning, white: np.ndarray, most: int, seconds: float, looking: bool
+) -> tuple[Curve, np.ndarray]:
+    """Learn batch after batch, until there are enough of them or time is up; look at about ten if at any.
+
+    Returns the curve, and the seconds of the processor and by the clock that a batch took.
+    """
     curve: Curve = []
-    spent = 0.0
+    spent = np.zeros(2)
     next_look = 0.0
     for i, batch in enumerate(batches(len(white), learner.batch_size, np.random.default_rng(0)), 1):
-        began = time.perf_counter()
+        began = np.array([time.process_time(), time.perf_counter()])
         learner.partial_fit(white[batch])
-        spent += time.perf_counter() - began
-        done = i >= most or spent >= seconds
-        if done or spent >= next_look:
-            curve.append((spent, lasso_objective(white, learner.components_, learner.alpha)))
-            next_look = spent + seconds / 10
+        spent += np.array([time.process_time(), time.perf_counter()]) - began
+        done = i >= most or spent[1] >= seconds
+        if looking and (done or spent[1] >= next_look):
+            curve.append((spent[1], lasso_objective(white, learner.components_, learner.alpha)))
+            next_look = spent[1] + seconds / 10
         if done:
-            learner.set_params(max_iter=i)
-            return curve
+            return curve, spent / i
     raise AssertionError("batches never end")
 
 
@@ -103,6 +122,7 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--seconds", type=float, default=60, help="for scikit-learn at most")
     parser.add_argument("--jobs", type=int, default=1, help="of scikit-learn's lasso")
+    parser.add_argument("--scaled-to", type=int, help="volumes that times are scaled to")
     arguments = parser.parse_args()
     k, passes = arguments.filters, arguments.passes
     white = volumes_of(arguments.recording, arguments.volumes, arguments.patch, arguments.bins)
@@ -113,9 +133,7 @@ def main() -> None:
     both = {"max_iter": passes, "tol": 0.0, "random_state": 0}
     inverse = DictionaryLearner(k, threshold=threshold, coherence=0.0, **both)
     direct = TransformLearner(k, threshold=THRESHOLDS["direct"], **both)
-    clone(inverse).set_params(max_iter=1).fit(white[: max(k, 300)])  # compiled before it is timed
-    mine = timed_iterations(inverse, white)
-    transform = timed_iterations(direct, white)
+    clone(inverse).set_params(n_atoms=10, max_iter=1).fit(white[:300])  # compiled before it is timed
     other = MiniBatchDictionaryLearning(
         k,
         alpha=threshold,
@@ -127,19 +145,27 @@ def main() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         clone(other).set_params(n_components=2).partial_fit(white[:300])  # its workers have started
-        theirs = timed_batches(other, white, arguments.batches, arguments.seconds)
-
-    print(f"\n{'seconds':>8} {'dictionary':>12} {'scikit-learn':>12}")
-    for seconds in sorted({when for curve in (mine, theirs) for when, _ in curve}):
-        print(f"{seconds:8.2f} {at(mine, seconds)} {at(theirs, seconds)}")
-    one_pass = theirs[-1][0] / other.max_iter * n / arguments.batch_size
-    print(f"\nseconds for {passes} passes over {n:,} volumes")
-    for name, spent in (
-        ("scikit-learn", one_pass * passes),
-        ("dictionary", mine[-1][0]),
-        ("transform", transform[-1][0]),
-    ):
-        print(f"{name:>12} {spent:10.1f}   1/{one_pass * passes / spent:.0f}")
+        looking = arguments.scaled_to is None
+        theirs, batch = timed_batches(other, white, arguments.batches, arguments.seconds, looking)
+    total = n if looking else arguments.scaled_to
+    one = batch * passes * total / arguments.batch_size
+    print(f"\nseconds for {passes} passes over {total:,} volumes, of the processor and by the clock")
+    print(f"{'scikit-learn':>12} {one[0]:10.1f} {'':>6} {one[1]:10.1f}", flush=True)
+    curves = {}
+    for name, learner in (("transform", direct), ("dictionary", inverse)):
+        if looking:
+            processor = time.process_time()
+            curves[name] = timed_iterations(learner, white)
+            spent = np.array([time.process_time() - processor, curves[name][-1][0]])
+        else:
+            spent = scaled(learner, white, total)
+        shares = [f"1/{share:.1f}" for share in one / spent]
+        print(f"{name:>12} {spent[0]:10.1f} {shares[0]:>6} {spent[1]:10.1f} {shares[1]:>6}", flush=True)
+    if looking:
+        mine = curves["dictionary"]
+        print(f"\nobjective\n{'seconds':>8} {'dictionary':>12} {'scikit-learn':>12}")
+        for seconds in sorted({when for curve in (mine, theirs) for when, _ in curve}):
+            print(f"{seconds:8.2f} {at(mine, seconds)} {at(theirs, seconds)}")
 
 
 if __name__ == "__main__":

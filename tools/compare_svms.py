@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import GridSearchCV, StratifiedKFold
+from sklearn.model_selection import GridSearchCV, StratifiedGroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import LinearSVC
@@ -65,10 +65,11 @@ def main() -> None:
     if arguments.grid:
         trained, spent = timed(lambda: train_classifier(x, y.tolist(), surfaces))
         print(f"{'':>12} processor    clock\n{'ours':>12} {spent}  {trained.provenance}")
+        folds = StratifiedGroupKFold(3, shuffle=True, random_state=0).split(x, y, np.arange(len(y)))
         grid = GridSearchCV(
             make_pipeline(FunctionTransformer(normalise_features), StandardScaler(), LinearSVM()),
             {"linearsvm__C": BLIND},
-            cv=StratifiedKFold(3, shuffle=True, random_state=0),
+            cv=list(folds),
         )
         _, spent = timed(lambda: grid.fit(x, y))
         scores = dict(zip(BLIND, grid.cv_results_["mean_test_score"].round(4).tolist(), strict=True))
