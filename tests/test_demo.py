@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 import typer
@@ -15,9 +16,8 @@ from streamfeat.recording import open_recording
 def small(monkeypatch, tmp_path):
     """Fewer digits, fewer filters; in an empty folder."""
     monkeypatch.setattr(demo, "SIZES", {"train": 30, "test": 4})
-    monkeypatch.setattr(demo, "_FILTERS", 4)
-    monkeypatch.setattr(demo, "_VOLUMES", 500)
-    monkeypatch.setattr(demo, "_ITERATIONS", 1)
+    few = replace(demo._SETTING, filters=4, volumes=500, iterations=1)
+    monkeypatch.setattr(demo, "_SETTING", few)
     monkeypatch.setattr(demo, "_SPEED", 1000.0)
     monkeypatch.chdir(tmp_path)
 

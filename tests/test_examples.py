@@ -5,6 +5,7 @@ import importlib
 import runpy
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ def test_a_custom_sink(monkeypatch, tmp_path, capsys):
     assert {row.split(",")[1] for row in rows[1:]} == set("0123456789")
 
 
+@pytest.mark.filterwarnings("ignore:Persisting input arguments")  # of joblib, on a slow machine
 def test_a_grid_search(capsys):
     score = example("grid_search")["main"](60)
     assert score > 0.3  # ten classes, forty samples to learn from
@@ -70,7 +72,9 @@ def test_training_on_a_folder(tmp_path, capsys):
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, events)
     (tmp_path / "in/left/broken.npy").write_bytes(b"nothing")
-    score = example("train_on_your_folder")["main"](str(tmp_path / "in"), str(tmp_path / "out"), 8, 1000, 2)
+    module = example("train_on_your_folder")
+    small = replace(module["SETTING"], filters=8, volumes=1000, iterations=2)
+    score = module["main"](str(tmp_path / "in"), str(tmp_path / "out"), small)
     said = capsys.readouterr().out
     assert score > 0.6
     assert "left out: " in said

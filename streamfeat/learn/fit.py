@@ -7,7 +7,6 @@ import datetime
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,9 @@ _HISTORY = ("iterations", "objective", "condition", "coherence")
 _WEIGHTS = ("conditioning", "coherence", "log_det")
 """Parameters of learners that weigh the terms of `Omega`."""
 
+_WHOLE = 0.95
+"""Share of the labelled samples that a window shall hold whole."""
+
 Report = Callable[[str, int, int, str], None]
 """Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
 
@@ -40,8 +42,9 @@ def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
     """The geometry that a setting means for these recordings.
 
     Args:
-        setting: where its `window_ms` is None, the median of the labelled samples that are not held out
-            fills the window; 100 ms without labels.
+        setting: where its `window_ms` is None, 19 of 20 labelled samples that are not held out are no longer
+            than the window: of a sample that is a little longer, the whole oldest bin would be out of it.
+            100 ms without labels.
         recordings: open recordings.
 
     Raises:
@@ -52,7 +55,7 @@ def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
     else:
         labels = [label for recording in recordings for label in recording.labels]
         durations = [label.duration_us for label in labels if label.split not in HELD_OUT_SPLITS]
-        window_us = round(median(durations or [100_000]))
+        window_us = int(np.quantile(durations or [100_000], _WHOLE, method="higher"))
     given = asdict(setting)
     same = {field.name: given[field.name] for field in fields(Geometry) if field.name in given}
     return Geometry(n_bins=setting.bins, bin_us=max(1, -(-window_us // setting.bins)), **same)

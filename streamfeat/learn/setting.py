@@ -49,7 +49,8 @@ class Setting:
         patch: rows and columns of a local volume, in ring pixels.
         stride: ring pixels between neighbouring volumes.
         bins: time bins in the window.
-        window_ms: length of the window; None for that of the median labelled sample, 100 ms without labels.
+        window_ms: length of the window; None for one that holds 95 % of the labelled
+            samples whole, 100 ms without labels.
         downsample: sensor pixels along each side of a ring pixel.
         max_count: counts are clipped to `[-max_count, max_count]`.
         pooling: cells along each side of the grid of volumes; codes are summed over each cell.

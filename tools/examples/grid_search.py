@@ -16,6 +16,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 import streamfeat as sf
 from streamfeat.classifier import normalise_features
 from streamfeat.learn.fit import learn_encoder
+from streamfeat.learn.setting import Setting
 from streamfeat.svm import LinearSVM
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "digits_train.mcap"
@@ -26,8 +27,8 @@ def main(n_samples: int = 120) -> float:
     with sf.open_recording(RECORDING) as recording:
         samples = list(recording.samples())[:n_samples]
         for patch in (4, 8):
-            geometry = sf.Geometry(patch=patch, stride=4, n_bins=3, bin_us=100_000, max_count=2)
-            encoders.append(learn_encoder([recording], geometry, n_filters=16, n_volumes=1_000, max_iter=3))
+            setting = Setting(patch=patch, stride=4, max_count=2, filters=16, volumes=1_000, iterations=3)
+            encoders.append(learn_encoder([recording], setting))
 
     # Features of each encoder and fold are kept, so that values of C cost next to nothing.
     with tempfile.TemporaryDirectory() as memory:

@@ -15,10 +15,13 @@ import streamfeat as sf
 from streamfeat.classifier import train_classifier
 from streamfeat.features import encode_samples
 from streamfeat.foreign.datasets import convert
-from streamfeat.learn.fit import bin_length, learn_encoder
+from streamfeat.learn.fit import learn_encoder
+from streamfeat.learn.setting import Setting
+
+SETTING = Setting(patch=10, stride=4, max_count=2, filters=100, volumes=10_000, iterations=10)
 
 
-def main(folder: str, out: str, n_filters: int = 100, n_volumes: int = 10_000, max_iter: int = 10) -> float:
+def main(folder: str, out: str, setting: Setting = SETTING) -> float:
     target = Path(out)
     target.mkdir(parents=True, exist_ok=True)
 
@@ -28,12 +31,8 @@ def main(folder: str, out: str, n_filters: int = 100, n_volumes: int = 10_000, m
         print(f"left out: {path}: {reason}")
 
     with sf.open_recording(target / "recording.mcap") as recording:
-        bin_us = bin_length([recording], 3, None)  # the window is as long as the median sample
-        geometry = sf.Geometry(patch=10, stride=4, n_bins=3, bin_us=bin_us, max_count=2)
-        # Held-out samples are not looked at.
-        encoder = learn_encoder(
-            [recording], geometry, n_filters=n_filters, n_volumes=n_volumes, max_iter=max_iter
-        )
+        # Held-out samples are not looked at. The window is as long as the median sample.
+        encoder = learn_encoder([recording], setting)
         encoded = list(encode_samples(encoder, recording.samples()))
 
     seen = [(label.label, row) for label, row in encoded if label.split == "train"]
