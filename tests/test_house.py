@@ -34,7 +34,7 @@ LAYERS = [
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
-    {"evaluate", "latency"},
+    {"evaluate", "latency", "view"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -61,9 +61,11 @@ ROOMS = {
         {"cell", "page"},
         {"run"},
     ],
+    "view": [{"channels", "layout", "observe", "page", "pictures"}, {"sink"}, {"job"}],
     "cli": [
         {"options", "program"},
         {"evaluating", "learning", "live", "measuring", "recordings", "streaming"},
+        {"viewing"},
     ],
 }
 """The same inside packages that are one place in the layers."""
@@ -82,10 +84,12 @@ ONLY_IN = {
         "cli.live",
         "cli.measuring",
         "cli.streaming",
+        "cli.viewing",
     },
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
+    "foxglove": {"view.channels"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch"},
 }
 

@@ -10,11 +10,11 @@ from typing import NoReturn
 
 from rich.markup import escape
 
-from streamfeat.cli import evaluating, learning, live, measuring, recordings, streaming
+from streamfeat.cli import evaluating, learning, live, measuring, recordings, streaming, viewing
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
-__all__ = ["app", "evaluating", "learning", "live", "main", "measuring", "recordings", "streaming"]
+__all__ = ["app", "evaluating", "learning", "live", "main", "measuring", "recordings", "streaming", "viewing"]
 
 
 def main() -> NoReturn:

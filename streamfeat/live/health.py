@@ -149,6 +149,21 @@ class Health:
         yield depth
         yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
 
+    def drops(self) -> dict[str, int]:
+        """What was not used, or was strange, by reason: packets, and (`late`, `rejected`) events."""
+        stats, delivery = self._cameras.stats(), self.delivery()
+        return {
+            "lost": delivery.lost,
+            "unheard": delivery.unheard,
+            "dropped": self._inbox.dropped,
+            "duplicates": delivery.duplicates,
+            "reordered": delivery.reordered,
+            "restarts": delivery.restarts,
+            "foreign": delivery.foreign,
+            "late": stats.late,
+            "rejected": stats.rejected,
+        }
+
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
         stats, delivery = self._cameras.stats(), self.delivery()
@@ -166,18 +181,7 @@ class Health:
         if stats.correct is not None and stats.samples:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
-        result |= {
-            "lost": delivery.lost,
-            "unheard": delivery.unheard,
-            "dropped": self._inbox.dropped,
-            "duplicates": delivery.duplicates,
-            "reordered": delivery.reordered,
-            "restarts": delivery.restarts,
-            "foreign": delivery.foreign,
-            "late": stats.late,
-            "rejected": stats.rejected,
-            "warnings": dict(sorted(self._reasons().items())),
-        }
+        result |= self.drops() | {"warnings": dict(sorted(self._reasons().items()))}
         if self._latencies:
             ordered = sorted(self._latencies)
             for name, share in (("p50", 0.5), ("p99", 0.99)):

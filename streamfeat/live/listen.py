@@ -5,6 +5,7 @@ Not here: each of the parts.
 """
 
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
@@ -16,6 +17,7 @@ from streamfeat.classifier import Classifier
 from streamfeat.codecs import ENCODINGS, encode, make_decoder
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.live.health import Health, parse_address
@@ -57,6 +59,7 @@ class Listen:
         patience_s: how long packets may wait before readings are left out for them.
         max_delay_s: how long packets may wait before the oldest are dropped.
         console: for warnings.
+        engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -78,6 +81,7 @@ class Listen:
         patience_s: float = PATIENCE_S,
         max_delay_s: float = MAX_DELAY_S,
         console: Console | None = None,
+        engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = EmitPolicy.parse(emit)
@@ -90,6 +94,7 @@ class Listen:
         self._address = parse_address(metrics) if metrics else None
         self._names = names
         self._learn_online, self._reliable = learn_online, reliable
+        self._engine_of = engine_of
         self._zenoh_config, self._port = zenoh_config, port
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
@@ -108,6 +113,7 @@ class Listen:
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
         more: Sink[Emission] | None = None,
+        publish: bool = True,
     ) -> None:
         """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
 
@@ -117,6 +123,7 @@ class Listen:
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
             more: one sink more.
+            publish: put features and predictions on the network, beside the events.
 
         Raises:
             InputError: an output, the network or the metrics address cannot be used.
@@ -124,7 +131,7 @@ class Listen:
         self._warm_up()
         with open_session(self._zenoh_config, port=self._port) as session:
             sinks = open_sinks(
-                partial(OutputSink, session, self._names, self.health.on_published),
+                partial(OutputSink, session, self._names, self.health.on_published) if publish else None,
                 partial(TerminalSink, console) if console else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
@@ -158,13 +165,17 @@ class Listen:
             make_decoder(encoding).decode(payload, base_ns)
         # One in time and one too late: the two ways to feed.
         for log_time_ns in (time.time_ns(), 0):
-            session = self._make_session("")
+            session = self._make_session("", Engine)
             for _ in session.process(Packet("", event, (side, side), log_time_ns, 0)):
                 pass
             for _ in session.finish():
                 pass
 
-    def _make_session(self, topic: str) -> Session:
+    def drops(self) -> dict[str, int]:
+        """What did not come to bear so far, by reason; may be called from another thread."""
+        return self.health.drops()
+
+    def _make_session(self, topic: str, engine: Callable[..., Engine] | None = None) -> Session:
         return Session(
             self._encoder,
             self._policy,
@@ -173,6 +184,7 @@ class Listen:
             clock=time.perf_counter,
             topic=topic,
             is_behind=lambda log_time_ns: time.time_ns() - log_time_ns > self._patience_ns,
+            engine=engine or self._engine_of(topic),
         )
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
