@@ -69,9 +69,11 @@ class Browser:
         self.resize(width, height, fineness)
 
     def __enter__(self) -> "Browser":
+        """Give the browser itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close it, and what it kept on disk."""
         self._session = ""
         try:
             self.ask("Browser.close")
@@ -129,9 +131,13 @@ class Browser:
             self.value("new Promise((done) => setTimeout(done, 20))")
         return value
 
+    def settle(self) -> None:
+        """Wait until the page has drawn what it knows."""
+        self.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
     def screenshot(self, path: Path) -> None:
         """Write a PNG of what can be seen."""
-        self.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.settle()
         path.write_bytes(base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"]))
 
     def _next(self) -> dict[str, Any]:

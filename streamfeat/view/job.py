@@ -5,8 +5,8 @@ Not here: the job itself (`replay`, `live.listen`), what is shown (`sink`).
 """
 
 import signal
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from threading import Event, current_thread, main_thread
@@ -113,17 +113,17 @@ class View:
         waits = self._is_recording and self._live_port is not None
         with ExitStack() as serving:
             with ExitStack() as writing:
-                self._open(serving, writing)
-                if self._is_recording:
-                    self._wait(_warm_up, self._encoder, self._policy)
-                if waits:
-                    self._say("waiting for somebody to look; Ctrl-C ends")
-                    self._wait(self._until, self._looked)
+                with self._heeding_signals():
+                    self._open(serving, writing)
+                    if self._is_recording:
+                        _warm_up(self._encoder, self._policy)
+                    if waits:
+                        self._wait_for(self._looked, "waiting for somebody to look; Ctrl-C ends")
                 if not self._stopped.is_set():
                     self._job.run(more=self._sink, **options)
             if waits and not self._job.interrupted:
-                self._say("that was all; Ctrl-C ends")
-                self._wait(self._until, self._stopped)
+                with self._heeding_signals():
+                    self._wait_for(self._stopped, "that was all; Ctrl-C ends")
 
     def write_layout(self, path: Path, topic: str) -> None:
         """Write a Foxglove layout that shows all channels of a camera.
@@ -170,18 +170,21 @@ class View:
             serving.callback(server.close)
             self._say(f"page: http://127.0.0.1:{server.port}")
 
-    def _wait(self, what: Callable[..., None], *arguments: Any) -> None:
-        """Do something during which SIGINT and SIGTERM mean to stop; compiling does not bear being cut off."""
+    @contextmanager
+    def _heeding_signals(self) -> Iterator[None]:
+        """SIGINT and SIGTERM mean to stop, and wait for what is under way: compiling cannot be cut off."""
         # Only the main thread of a process can be told of signals.
         names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
         before = {name: signal.signal(name, lambda *_: self._stopped.set()) for name in names}
         try:
-            what(*arguments)
+            yield
         finally:
             for name, handler in before.items():
                 signal.signal(name, handler)
 
-    def _until(self, event: Event) -> None:
+    def _wait_for(self, event: Event, line: str) -> None:
+        if not self._stopped.is_set():
+            self._say(line)
         while not event.is_set() and not self._stopped.is_set():
             event.wait(_TURN_S)
 

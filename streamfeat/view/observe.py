@@ -3,9 +3,9 @@
 Lives here: an engine that leaves a copy of what it sees now and then; how often; where the copy waits.
 Not here: pictures (`pictures`), and who looks at them (`sink`).
 
-An observed engine does what any engine does. After a reading, when the last look is long enough ago, it copies
-counts and activity, which takes about as long as reading after a few events does. A copy that nobody has taken
-when the next one comes is replaced and counted: whoever looks slowly sees fewer pictures.
+An observed engine does what any engine does. After a reading, when the last look is long enough ago, it
+copies counts and activity, which takes about as long as reading after a few events does. A copy that nobody
+has taken when the next one comes is replaced and counted: whoever looks slowly sees fewer pictures.
 """
 
 import time

@@ -20,7 +20,6 @@ __all__ = [
     "bins_picture",
     "event_picture",
     "feature_columns",
-    "gap_of",
     "volume_picture",
 ]
 
@@ -80,7 +79,8 @@ def bins_picture(counts: NDArray[np.int32], max_count: int) -> Picture:
         max_count: where counts are clipped, the full range of the picture.
 
     Returns:
-        `(h, n_bins * w + (n_bins - 1) * max(1, w // 32))` uint8, signed as above; `h, w` are `H, W` or smaller.
+        `(h, n_bins * w + (n_bins - 1) * max(1, w // 32))` uint8, signed as above, where `h, w` are `H, W` or
+        smaller.
     """
     clipped = counts.clip(-max_count, max_count) / max_count
     tiles = [_shrink(tile, max(_WIDEST // len(counts), 1)) for tile in _signed(clipped)]

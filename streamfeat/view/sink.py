@@ -130,7 +130,7 @@ class ViewSink:
             "camera": sight.topic,
             "width": sight.resolution[1],
             "height": sight.resolution[0],
-            "events": sight.stats.events,
+            "events": shown.events,
             "events_per_s": round(rate),
             "active_volumes": int(np.count_nonzero(sight.activity)),
             "volumes": sight.activity.size,
@@ -176,16 +176,20 @@ class _Shown:
 
     def __init__(self) -> None:
         self.frame = 0
-        self._events = 0
+        self.events = 0
+        self._of_engine = 0
         self._now_us: int | None = None
 
     def rate(self, sight: Sight) -> float:
         """Events a second of stream time since the last sight, which this one becomes."""
         passed_us = sight.now_us - self._now_us if self._now_us is not None else 0
-        events = sight.stats.events - self._events
-        self._now_us, self._events = sight.now_us, sight.stats.events
+        # A sensor that becomes another one gets another engine, which counts from nothing.
+        before = self._of_engine if sight.stats.events >= self._of_engine else 0
+        new = sight.stats.events - before
         self.frame += 1
-        return 1e6 * events / passed_us if passed_us > 0 and events >= 0 else 0.0
+        self.events += new
+        self._now_us, self._of_engine = sight.now_us, sight.stats.events
+        return 1e6 * new / passed_us if passed_us > 0 else 0.0
 
 
 def about(encoder: Encoder, labels: Sequence[str]) -> dict[str, str]:

@@ -54,7 +54,7 @@ const listener = {
     const cameras = channels.filter(({ schemaName }) => schemaName === "streamfeat.Status");
     const chooser = at("camera");
     const before = chooser.value;
-    const names = cameras.map(({ topic }) => topic.slice(0, topic.lastIndexOf("/")));
+    const names = cameras.map(({ topic }) => topic.slice(0, topic.lastIndexOf("/"))).sort();
     chooser.replaceChildren(...names.map((name) => new Option(name.replace(/\/view$/, "") || "recording", name)));
     if (names.includes(before)) chooser.value = before;
     at("chooser").hidden = names.length < 2;
@@ -137,6 +137,7 @@ function drawAll() {
       colours: [colour("accent"), colour("off")],
       unit: "time, log scale",
       logarithmic: true,
+      joined: false,
       label: duration,
     }),
   );
@@ -146,8 +147,10 @@ function drawAll() {
 function drawFeatures(canvas) {
   const { features } = model.last;
   const quadrants = QUADRANTS.map((name) => ({ name: name.replace("_", " "), ...features[name] }));
-  // The scale holds whatever was seen lately, in round steps, so that it can be read.
-  const largest = roundUp(Math.max(...model.reach.map((point) => point.largest)) || 1);
+  // A round scale that most of the latest readings fit into, and this one always does.
+  const reached = model.reach.map(({ largest }) => largest);
+  const usual = [...reached].sort((one, other) => one - other)[Math.floor(0.8 * reached.length)];
+  const largest = roundUp(Math.max(usual, reached[reached.length - 1]) || 1);
   const shared = features.filters_per_column;
   at("features-note").textContent =
     "pooled codes by quadrant: positive up, negative down" + (shared > 1 ? `; largest of ${shared} filters` : "");

@@ -67,28 +67,39 @@ function bitmap(image, colours, first, last) {
   return sheet;
 }
 
-/** `tiles` pictures side by side, `gap` columns apart in the image, with a caption under each that has room. */
+/**
+ * The tiles of a picture, one for each caption, in rows that make them as large as possible. In the image they lie
+ * side by side, `gap` columns apart. Captions that have no room are left out.
+ */
 function drawPicture(canvas, image, colours, captions = [""], gap = 0) {
   const { context, width, height } = cleared(canvas);
   const tiles = captions.length;
   const wide = (image.width - (tiles - 1) * gap) / tiles;
-  const room = captions.some((caption) => caption) ? 18 : 0;
-  const apart = tiles > 1 ? 6 : 0;
-  const scale = Math.min((width - (tiles - 1) * apart) / (tiles * wide), (height - room) / image.height);
+  const under = captions.some((caption) => caption) ? 18 : 0;
+  const apart = 6;
+  const arranged = [1, 2, 3].map((rows) => {
+    const columns = Math.ceil(tiles / rows);
+    const across = (width - (columns - 1) * apart) / (columns * wide);
+    const down = (height / rows - under) / image.height;
+    return { rows, columns, scale: Math.min(across, down) };
+  });
+  const { rows, columns, scale } = arranged.reduce((best, other) => (other.scale > best.scale ? other : best));
   const [w, h] = [wide * scale, image.height * scale];
-  const left = (width - tiles * w - (tiles - 1) * apart) / 2;
-  const top = (height - room - h) / 2;
+  const left = (width - columns * w - (columns - 1) * apart) / 2;
+  const above = (height - rows * (h + under)) / 2;
+  const widest = Math.max(...captions.map((caption) => context.measureText(caption).width)) + 8;
+  const every = Math.ceil(widest / (w + apart));
   context.imageSmoothingEnabled = false;
   context.textAlign = "center";
   captions.forEach((caption, i) => {
-    const x = left + i * (w + apart);
+    const x = left + (i % columns) * (w + apart);
+    const y = above + Math.floor(i / columns) * (h + under);
     const first = i * (wide + gap);
-    context.drawImage(bitmap(image, colours, first, first + wide), x, top, w, h);
+    context.drawImage(bitmap(image, colours, first, first + wide), x, y, w, h);
     context.strokeStyle = colour("line");
-    context.strokeRect(x + 0.5, top + 0.5, w - 1, h - 1);
+    context.strokeRect(x + 0.5, y + 0.5, w - 1, h - 1);
     context.fillStyle = colour("soft");
-    const every = Math.ceil((context.measureText(caption).width + 10) / (w + apart));
-    if ((tiles - 1 - i) % every === 0) context.fillText(caption, x + w / 2, top + h + 11);
+    if ((tiles - 1 - i) % every === 0) context.fillText(caption, x + w / 2, y + h + 11);
   });
 }
 
@@ -119,10 +130,10 @@ function roundUp(value) {
   return power * [1, 2, 5, 10].find((factor) => factor * power >= value * (1 - 1e-9));
 }
 
-/** Middle of the distances between neighbours, to tell a gap from a step. */
-function usualStep(times) {
-  const steps = times.slice(1).map((t, i) => t - times[i]).sort((a, b) => a - b);
-  return steps.length ? steps[Math.floor(steps.length / 2)] : 0;
+/** Middle of the distances between neighbours of one part, to tell a silence from a step. */
+function usualStep(points) {
+  const steps = points.slice(1).flatMap(({ t, part }, i) => (part === points[i].part ? [t - points[i].t] : []));
+  return steps.sort((a, b) => a - b)[Math.floor(steps.length / 2)] || 1;
 }
 
 /**
@@ -131,7 +142,7 @@ function usualStep(times) {
  */
 function places(points) {
   const times = points.map(({ t }) => t);
-  const step = usualStep(times) || 1;
+  const step = usualStep(points);
   const starts = points.map(({ part }, i) => !i || part !== points[i - 1].part || times[i] - times[i - 1] > 8 * step);
   const along = [0];
   for (let i = 1; i < points.length; i++) along.push(along[i - 1] + (starts[i] ? 2 * step : times[i] - times[i - 1]));
@@ -142,9 +153,9 @@ function places(points) {
 /**
  * Lines over stream time.
  * `points` are `{t, values, part}` in order: with another part, or after a long silence, a line begins anew.
- * `strips` are `{name, colours}`, a colour or null for each point, drawn above the lines.
+ * `joined` tells whether there are lines at all, or dots. `strips` are `{name, colours}`, a colour or null for each point, drawn above the lines.
  */
-function drawLines(canvas, { points, colours, unit, logarithmic = false, label = number, strips = [] }) {
+function drawLines(canvas, { points, colours, unit, logarithmic = false, joined = true, label = number, strips = [] }) {
   const { context, width, height } = cleared(canvas);
   const shown = points.flatMap(({ values }) => values.filter((value) => !logarithmic || value > 0));
   let [low, high] = [Math.min(...shown), Math.max(...shown)];
@@ -155,7 +166,7 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, label =
     const margin = (high - low || Math.abs(high) || 1) * 0.06;
     [low, high] = [low - margin, high + margin];
   }
-  const box = { left: 66, right: width - 8, top: 8 + strips.length * 15, bottom: height - 36 };
+  const box = { left: 66, right: width - 8, top: 8 + strips.length * 15, bottom: height - 38 };
   const marks = logarithmic
     ? Array.from({ length: Math.round(Math.log10(high / low)) + 1 }, (_, i) => low * 10 ** i)
     : ticks(low, high, Math.max(2, Math.floor((box.bottom - box.top) / 36)));
@@ -175,8 +186,8 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, label =
       const value = values[series];
       if (logarithmic && !(value > 0)) return;
       const at = y(value);
-      if (starts[i] && starts[i + 1] !== false) context.fillRect(xs[i] - 1.5, at - 1.5, 3, 3);
-      if (starts[i]) context.moveTo(xs[i], at);
+      if (!joined || (starts[i] && starts[i + 1] !== false)) context.fillRect(xs[i] - 1.5, at - 1.5, 3, 3);
+      if (starts[i] || !joined) context.moveTo(xs[i], at);
       else context.lineTo(xs[i], at);
     });
     context.stroke();
@@ -202,19 +213,19 @@ function drawAxes(context, box, { begins, points, xs, marks, y, unit, label }) {
     const at = Math.round(y(mark)) + 0.5;
     line(context, box.left, at, box.right, at, "grid");
     context.fillStyle = colour("soft");
-    context.fillText(label(mark), box.left - 6, at);
+    context.fillText(label(mark), box.left - 6, Math.min(at, box.bottom - 4));
   });
   context.textAlign = "center";
   let free = box.left - 30;
   timeMarks(begins, points, xs, box).forEach(({ t, x }) => {
     if (begins.length > 1) line(context, Math.round(x) - 3.5, box.top, Math.round(x) - 3.5, box.bottom, "grid");
-    const text = number(Math.round(t * 100) / 100);
+    const text = t.toFixed(t < 100 ? 2 : 1);
     const half = context.measureText(text).width / 2;
     if (x - half < free || x + half > box.right + 6) return;
-    context.fillText(text, x, box.bottom + 11);
+    context.fillText(text, x, box.bottom + 14);
     free = x + half + 14;
   });
-  context.fillText("stream time (s)", (box.left + box.right) / 2, box.bottom + 27);
+  context.fillText("stream time (s)", (box.left + box.right) / 2, box.bottom + 30);
   upward(context, unit, (box.top + box.bottom) / 2);
 }
 
