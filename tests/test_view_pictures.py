@@ -75,20 +75,36 @@ def test_empty_volumes_are_told_from_quiet_ones():
 
 def test_features_have_columns_up_and_down():
     split = np.arange(4 * 6, dtype=np.float32)
-    columns = feature_columns(split, "split")
+    columns = feature_columns(split, "split", 2)
     assert columns.filters == 1
     np.testing.assert_array_equal(columns.positive[1], [6, 7, 8])
     np.testing.assert_array_equal(columns.negative[1], [9, 10, 11])
-    soft = feature_columns(np.array([1, -2, 0, 0, 0, 0, 0, 3], np.float32), "soft")
+    soft = feature_columns(np.array([1, -2, 0, 0, 0, 0, 0, 3], np.float32), "soft", 2)
     np.testing.assert_array_equal(soft.positive, [[1, 0], [0, 0], [0, 0], [0, 3]])
     np.testing.assert_array_equal(soft.negative, [[0, 2], [0, 0], [0, 0], [0, 0]])
 
 
 def test_more_filters_than_columns_share_them():
     features = np.random.default_rng(0).random((4, 1700)).astype(np.float32)
-    columns = feature_columns(features.ravel(), "triangle")
+    columns = feature_columns(features.ravel(), "triangle", 2)
     assert columns.filters == 14
     assert columns.positive.shape == (4, 122)
     np.testing.assert_array_equal(columns.positive[2, 3], features[2, 42:56].max())
     np.testing.assert_array_equal(columns.positive[3, -1], features[3, 1694:].max())
     assert (columns.negative == 0).all()
+
+
+@pytest.mark.parametrize("pooling", [1, 3, 4])
+def test_cells_are_those_of_the_grid(pooling):
+    features = np.random.default_rng(0).random((pooling**2, 5)).astype(np.float32)
+    columns = feature_columns(features.ravel(), "triangle", pooling)
+    np.testing.assert_array_equal(columns.positive, features)
+
+
+def test_more_cells_than_a_plot_has_room_for_share_it():
+    features = np.random.default_rng(0).random((6, 6, 5)).astype(np.float32)
+    columns = feature_columns(features.ravel(), "triangle", 6)
+    assert columns.positive.shape == (16, 5)
+    np.testing.assert_array_equal(columns.positive[0], features[:1, :1].max(axis=(0, 1)))
+    np.testing.assert_array_equal(columns.positive[5], features[1:3, 1:3].max(axis=(0, 1)))
+    assert columns.positive.max() == features.max()

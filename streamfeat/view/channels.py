@@ -35,17 +35,12 @@ def _object(title: str, **properties: Any) -> dict[str, Any]:
     return {"type": "object", "title": title, "properties": properties}
 
 
-_QUADRANT = _object("quadrant", positive=_NUMBERS, negative=_NUMBERS)
-
 SCHEMAS = {
     "features": _object(
         "streamfeat.Features",
         t_s=_NUMBER,
         filters_per_column=_NUMBER,
-        top_left=_QUADRANT,
-        top_right=_QUADRANT,
-        bottom_left=_QUADRANT,
-        bottom_right=_QUADRANT,
+        cells={"type": "array", "items": _object("cell", positive=_NUMBERS, negative=_NUMBERS)},
     ),
     "prediction": _object(
         "streamfeat.Prediction",

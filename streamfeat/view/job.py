@@ -137,7 +137,8 @@ class View:
         """
         if "*" in topic:
             raise InputError(f"--layout needs the key of one camera; {topic!r} may be several")
-        write_atomically(path, foxglove_layout(prefix_of(topic), self._labels).encode())
+        pooling = self._encoder.geometry.pooling
+        write_atomically(path, foxglove_layout(prefix_of(topic), self._labels, pooling).encode())
 
     def stop(self) -> None:
         """End listening, or waiting; a recording plays to its end. May be called from any thread."""

@@ -10,16 +10,18 @@ from typing import Any
 
 __all__ = ["foxglove_layout"]
 
+_MOST_CELLS = 4
 _MOST_SERIES = 16
 """Scores in one plot; its legend has no room for more."""
 
 
-def foxglove_layout(prefix: str, labels: Sequence[str]) -> str:
+def foxglove_layout(prefix: str, labels: Sequence[str], pooling: int) -> str:
     """The layout as JSON, for "Import from file" in Foxglove's menu of layouts.
 
     Args:
         prefix: of the channels.
         labels: that the scores belong to; empty without a classifier.
+        pooling: cells along each side of the grid.
     """
     panels: dict[str, dict[str, Any]] = {
         f"Image!{name}": {"foxglovePanelTitle": title, "imageMode": {"imageTopic": f"{prefix}/{name}"}}
@@ -30,11 +32,11 @@ def foxglove_layout(prefix: str, labels: Sequence[str]) -> str:
         )
     }
     panels["Plot!features"] = _plot(
-        "Features by quadrant (negative parts are plotted downward by the page only)",
+        "Features of the first cells, row by row",
         "feature",
         [
-            (f"{prefix}/features.{quadrant}.{part}[:]", f"{quadrant.replace('_', ' ')}, {part}")
-            for quadrant in ("top_left", "top_right", "bottom_left", "bottom_right")
+            (f"{prefix}/features.cells[{cell}].{part}[:]", f"cell {cell + 1}, {part}")
+            for cell in range(min(pooling**2, _MOST_CELLS))
             for part in ("positive", "negative")
         ],
         xAxisVal="index",

@@ -35,7 +35,7 @@ _LARGEST = 640
 """Pixels along the longer side of a picture; a larger one is shrunk, for 20 a second must fit anywhere."""
 _WIDEST = 1600
 """The same for all bins side by side."""
-_MOST_COLUMNS = 128
+_MOST_COLUMNS, _MOST_CELLS = 512, 4
 
 
 def event_picture(
@@ -109,11 +109,11 @@ def volume_picture(activity: NDArray[np.int64]) -> Picture:
 
 
 class Columns(NamedTuple):
-    """Features of the four quadrants (top left, top right, bottom left, bottom right), for bars up and down.
+    """Features of each cell of the grid, row by row, for bars up and down.
 
     Attributes:
-        positive: `(4, n)` float32, at least 0.
-        negative: `(4, n)` float32, at least 0: sizes of negative parts.
+        positive: `(cells, n)` float32, at least 0.
+        negative: `(cells, n)` float32, at least 0: sizes of negative parts.
         filters: how many filters share a column, which has the largest of them.
     """
 
@@ -122,20 +122,33 @@ class Columns(NamedTuple):
     filters: int
 
 
-def feature_columns(features: NDArray[np.float32], encoding: str) -> Columns:
-    """Features by quadrant, positive and negative parts apart, in at most 128 columns.
+def feature_columns(features: NDArray[np.float32], encoding: str, pooling: int) -> Columns:
+    """Features by cell, positive and negative parts apart, in at most 512 columns and 4 x 4 cells.
+
+    Where there are more, neighbours share one, which has the largest of them.
 
     Args:
         features: `(n_features,)` float32, not changed.
         encoding: soft, split or triangle.
+        pooling: cells along each side of the grid.
     """
-    rows = features.reshape(4, -1)
+    cells = features.reshape(pooling, pooling, -1)
     if encoding == "split":
-        positive, negative = np.split(rows, 2, axis=1)
+        positive, negative = np.split(cells, 2, axis=2)
     else:
-        positive, negative = rows.clip(0), (-rows).clip(0)
-    filters = -(-positive.shape[1] // _MOST_COLUMNS)
-    return Columns(_largest_of(positive, filters), _largest_of(negative, filters), filters)
+        positive, negative = cells.clip(0), (-cells).clip(0)
+    side = min(pooling, _MOST_CELLS)
+    filters = -(-positive.shape[2] * side * side // _MOST_COLUMNS)
+    up, down = (_largest_of(_cells(part, side), filters) for part in (positive, negative))
+    return Columns(up, down, filters)
+
+
+def _cells(part: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """`(pooling, pooling, K)` as `(side * side, K)`."""
+    starts = np.arange(side) * len(part) // side
+    for axis in (0, 1):
+        part = np.maximum.reduceat(part, starts, axis=axis)
+    return part.reshape(side * side, -1)
 
 
 def _largest_of(rows: NDArray[np.float32], together: int) -> NDArray[np.float32]:

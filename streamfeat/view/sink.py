@@ -17,7 +17,6 @@ from streamfeat.view.pictures import bins_picture, event_picture, feature_column
 
 __all__ = ["Shows", "ViewSink", "about"]
 
-_QUADRANTS = ("top_left", "top_right", "bottom_left", "bottom_right")
 _DIGITS = 5
 
 
@@ -143,10 +142,15 @@ class ViewSink:
         }
 
     def _tell(self, e: Emission) -> None:
-        columns = feature_columns(e.features, self._encoder.encoding)
-        features: dict[str, Any] = {"t_s": e.t_us / 1e6, "filters_per_column": columns.filters}
-        for name, positive, negative in zip(_QUADRANTS, columns.positive, columns.negative, strict=True):
-            features[name] = {"positive": _short(positive), "negative": _short(negative)}
+        columns = feature_columns(e.features, self._encoder.encoding, self._encoder.geometry.pooling)
+        features = {
+            "t_s": e.t_us / 1e6,
+            "filters_per_column": columns.filters,
+            "cells": [
+                {"positive": _short(up), "negative": _short(down)}
+                for up, down in zip(columns.positive, columns.negative, strict=True)
+            ],
+        }
         prediction = self._prediction(e) if e.labels else None
         for board in self._boards:
             board.record(self._prefix(e.topic), "features", e.t_us, features)
@@ -205,6 +209,7 @@ def about(encoder: Encoder, labels: Sequence[str]) -> dict[str, str]:
         "bin_us": str(geometry.bin_us),
         "max_count": str(geometry.max_count),
         "downsample": str(geometry.downsample),
+        "pooling": str(geometry.pooling),
         "labels": "\n".join(labels),
     }
 

@@ -5,7 +5,7 @@ const QUIET_MS = 2000;
 const CLASS_COLOURS = [
   "#2f7ed8", "#e8731a", "#2ca25f", "#d6336c", "#8f63d2", "#a06a42", "#e05fb6", "#8a8f98", "#a7a51c", "#17a2b8",
 ];
-const QUADRANTS = ["top_left", "top_right", "bottom_left", "bottom_right"];
+const QUADRANTS = ["top left", "top right", "bottom left", "bottom right"];
 
 const DROPS = {
   dropped: "packets dropped",
@@ -22,13 +22,13 @@ const DROPS = {
 };
 
 const at = (id) => document.getElementById(id);
-const model = { about: null, last: {}, scores: [], latency: [], reach: [], frame: null, missed: 0, frames: 0 };
+const model = { about: null, last: {}, scores: [], latency: [], scale: 0, frame: null, missed: 0, frames: 0 };
 let heardMs = 0;
 let open = false;
 let dirty = true;
 
 function forget() {
-  Object.assign(model, { last: {}, scores: [], latency: [], reach: [], frame: null });
+  Object.assign(model, { last: {}, scores: [], latency: [], scale: 0, frame: null });
   dirty = true;
 }
 
@@ -70,10 +70,6 @@ const listener = {
       model.frame = message.frame;
       const { median, max, n } = message.update_us;
       if (n) keep(model.latency, { t: message.t_s, values: [median, max], part: 0 });
-    }
-    if (name === "features") {
-      const all = QUADRANTS.flatMap((quadrant) => [...message[quadrant].positive, ...message[quadrant].negative]);
-      keep(model.reach, { t: message.t_s, largest: Math.max(...all) });
     }
     if (name === "prediction") {
       const { t_s: t, scores, sample, label } = message;
@@ -146,15 +142,17 @@ function drawAll() {
 
 function drawFeatures(canvas) {
   const { features } = model.last;
-  const quadrants = QUADRANTS.map((name) => ({ name: name.replace("_", " "), ...features[name] }));
-  // A round scale that most of the latest readings fit into, and this one always does.
-  const reached = model.reach.map(({ largest }) => largest);
-  const usual = [...reached].sort((one, other) => one - other)[Math.floor(0.8 * reached.length)];
-  const largest = roundUp(Math.max(usual, reached[reached.length - 1]) || 1);
+  const { cells } = features;
+  const side = Math.sqrt(cells.length);
+  const place = (i) => (side === 1 ? "whole grid" : `row ${Math.floor(i / side) + 1}, column ${(i % side) + 1}`);
+  const named = cells.map((cell, i) => ({ name: side === 2 ? QUADRANTS[i] : place(i), ...cell }));
+  // A round scale that changes only where it must, so that it can be read.
+  const largest = Math.max(...named.flatMap(({ positive, negative }) => [...positive, ...negative]));
+  if (largest > model.scale || largest < model.scale / 4) model.scale = roundUp(largest || 1);
   const shared = features.filters_per_column;
   at("features-note").textContent =
-    "pooled codes by quadrant: positive up, negative down" + (shared > 1 ? `; largest of ${shared} filters` : "");
-  drawBars(canvas, quadrants, largest, model.about.filters, "pooled code");
+    "pooled codes by cell: positive up, negative down" + (shared > 1 ? `; largest of ${shared} filters` : "");
+  drawBars(canvas, named, model.scale, model.about.filters, "pooled code");
 }
 
 /** Classes that get a colour: all if they are few, else those that led most often. */

@@ -103,12 +103,15 @@ function drawPicture(canvas, image, colours, captions = [""], gap = 0) {
   });
 }
 
-/** Round numbers between two others, at most `most + 1` of them. */
+/** Round numbers between two others: about `most`, and three of them if they are to be had. */
 function ticks(low, high, most) {
   if (!(high > low)) return [low];
-  const step = roundUp((high - low) / most);
-  const found = [];
-  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + step * 1e-9; i++) found.push(i * step);
+  let found = [];
+  for (let parts = most; found.length < 3 && parts < most + 6; parts++) {
+    const step = roundUp((high - low) / parts);
+    found = [];
+    for (let i = Math.ceil(low / step - 1e-9); i * step <= high + step * 1e-9; i++) found.push(i * step);
+  }
   return found;
 }
 
@@ -169,7 +172,7 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, joined 
   const box = { left: 66, right: width - 8, top: 8 + strips.length * 15, bottom: height - 38 };
   const marks = logarithmic
     ? Array.from({ length: Math.round(Math.log10(high / low)) + 1 }, (_, i) => low * 10 ** i)
-    : ticks(low, high, Math.max(2, Math.floor((box.bottom - box.top) / 36)));
+    : ticks(low, high, Math.max(3, Math.floor((box.bottom - box.top) / 36)));
   const y = (value) => {
     const share = logarithmic ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
     return box.bottom - share * (box.bottom - box.top);
@@ -257,16 +260,17 @@ function upward(context, text, middle) {
   context.restore();
 }
 
-/** Four panels of bars, up and down, as the quadrants lie. `quadrants` are `{name, positive, negative}`. */
-function drawBars(canvas, quadrants, largest, filters, unit) {
+/** A panel of bars, up and down, for each cell, as the cells lie. `cells` are `{name, positive, negative}`. */
+function drawBars(canvas, cells, largest, filters, unit) {
   const { context, width, height } = cleared(canvas);
   const [left, between, under, above] = [56, 14, 20, 28];
-  const w = (width - left - between - 4) / 2;
-  const h = (height - under - 2 * above) / 2;
-  const below = quadrants.some(({ negative }) => negative.some((value) => value > 0));
-  quadrants.forEach(({ name, positive, negative }, i) => {
-    const x = left + (i % 2) * (w + between);
-    const top = above - 6 + Math.floor(i / 2) * (h + above);
+  const side = Math.sqrt(cells.length);
+  const w = (width - left - (side - 1) * between - 4) / side;
+  const h = (height - under - side * above) / side;
+  const below = cells.some(({ negative }) => negative.some((value) => value > 0));
+  cells.forEach(({ name, positive, negative }, i) => {
+    const x = left + (i % side) * (w + between);
+    const top = above - 6 + Math.floor(i / side) * (h + above);
     const zero = below ? top + h / 2 : top + h;
     const reach = zero - top;
     [...(below ? [-largest] : []), 0, largest].forEach((mark) => {
@@ -274,7 +278,7 @@ function drawBars(canvas, quadrants, largest, filters, unit) {
       line(context, x, at, x + w, at, mark === 0 ? "line" : "grid");
       context.fillStyle = colour("soft");
       context.textAlign = "right";
-      if (i % 2 === 0) context.fillText(number(mark), x - 6, at);
+      if (i % side === 0) context.fillText(number(mark), x - 6, at);
     });
     context.textAlign = "left";
     context.fillStyle = colour("text");
@@ -288,7 +292,7 @@ function drawBars(canvas, quadrants, largest, filters, unit) {
         if (length > 0) context.fillRect(x + k * bar, from, Math.max(bar * 0.8, 1), length);
       });
     });
-    if (i < 2) return;
+    if (i < side * (side - 1)) return;
     context.fillStyle = colour("soft");
     context.fillText("1", x, top + h + 12);
     context.textAlign = "right";
