@@ -269,6 +269,25 @@ class Engine:
             code[:] = state.code[0, 0, : operator.n_filters] / operator.unit
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
+    def counts(self) -> NDArray[np.int32]:
+        """The signed counts of the current window, a copy: `(n_bins, H, W)` int32, the oldest bin first, not
+        clipped.
+        """
+        return np.roll(self._state.counts, -1 - int(self._state.clock[CLOCK_SLOT]), axis=0)
+
+    def activity(self) -> NDArray[np.int64]:
+        """The sum of squared entries of every local volume, a copy: `(rows, columns)` int64; 0 is empty."""
+        self._update()
+        squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
+        return squares.reshape(self.grid_shape).copy()
+
+    @property
+    def window_us(self) -> tuple[int, int]:
+        """Stream time at which the oldest bin starts, and at which the current one ends."""
+        now, origin = int(self._state.clock[CLOCK_NOW]), int(self._state.clock[CLOCK_ORIGIN])
+        end = origin + (now + 1) * self._operator.bin_us
+        return end - self.encoder.geometry.window_us, end
+
     @property
     def n_events(self) -> int:
         """Events accepted and counted, as in `stats()`."""

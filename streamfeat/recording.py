@@ -10,7 +10,7 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -36,6 +36,8 @@ __all__ = [
     "Topic",
     "open_recording",
 ]
+
+_LOOP_GAP_US = 1_000_000
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
@@ -193,6 +195,23 @@ class Recording:
                 yield item
         for channel_id in self._expected:
             self._count_missing(channel_id, seen[channel_id], losses)
+
+    def played(self, *, loop: bool) -> Iterator[Packet | Label]:
+        """As `items`, and with `loop` again and again, a second after the end, with times that go on."""
+        yield from self.items()
+        if not loop or self.first_us is None or self.last_us is None:
+            return
+        step_us = self.last_us - self.first_us + _LOOP_GAP_US
+        shift_us = 0
+        while True:
+            shift_us += step_us
+            for item in self.items():
+                if isinstance(item, Packet):
+                    events = item.events.copy()
+                    events["t"] += shift_us
+                    yield replace(item, events=events)
+                else:
+                    yield replace(item, start_us=item.start_us + shift_us)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the labelled samples in stored order, with memory bounded by those open at a time.

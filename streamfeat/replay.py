@@ -5,7 +5,7 @@ Not here: how it is computed (`session`, `pipeline`), how it looks (`sinks`, `cl
 """
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,13 +15,14 @@ from rich.console import Console
 from streamfeat.classifier import Classifier
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.mcap_records import Losses
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, Packet, open_recording
+from streamfeat.recording import Label, Packet, Recording, open_recording
 from streamfeat.session import Session
-from streamfeat.sinks import JsonLinesSink, RecordingSink, TerminalSink, open_sinks
+from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
 from streamfeat.table import TableSink
 
 __all__ = ["Replay", "items_of_split", "parse_speed"]
@@ -39,6 +40,7 @@ class Replay:
         topic: event topic, where there are several.
         split: replay only samples of this split.
         learn_online: learn from each labelled sample after predicting it.
+        engine: makes the engines, see `Session`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -55,6 +57,7 @@ class Replay:
         topic: str | None = None,
         split: str | None = None,
         learn_online: bool = False,
+        engine: Callable[..., Engine] = Engine,
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
         policy = EmitPolicy.parse(emit)
@@ -73,10 +76,17 @@ class Replay:
         if reader:
             reader.check_fits(encoder, path=classifier or "the classifier")
         self._shape_of_emissions = encoder.n_features, reader.labels if reader else ()
-        self._session = Session(encoder, policy, reader, learn_online=learn_online, clock=time.perf_counter)
+        self._session = Session(
+            encoder,
+            policy,
+            reader,
+            learn_online=learn_online,
+            clock=time.perf_counter,
+            engine=engine,
+        )
         self._seconds = 0.0
         self.interrupted = False
-        self.losses = Losses()
+        self._played: Recording | None = None
 
     def run(
         self,
@@ -87,6 +97,8 @@ class Replay:
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
         table: Path | None = None,
+        more: Sink[Emission] | None = None,
+        loop: bool = False,
     ) -> None:
         """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
 
@@ -97,22 +109,40 @@ class Replay:
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
             table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
+            more: one sink more.
+            loop: start again at the end, with times that go on.
         """
         with open_recording(self._recording, self._topic) as rec:
+            self._played = rec
             sinks = open_sinks(
                 partial(TerminalSink, console, every_sample=every_sample) if console else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
                 partial(TableSink, table, *self._shape_of_emissions) if table else None,
+                (lambda: more) if more else None,
             )
-            items = items_of_split(rec.items(), self._split)
+            items = items_of_split(rec.played(loop=loop), self._split)
             pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
                 items, self._session, sinks, speed=self._speed
             )
             started = time.perf_counter()
             self.interrupted = run_until_interrupted([pipeline])
             self._seconds = time.perf_counter() - started
-            self.losses = rec.losses
+
+    @property
+    def losses(self) -> Losses:
+        """What could not be read, so far."""
+        return self._played.losses if self._played else Losses()
+
+    def drops(self) -> dict[str, int]:
+        """What did not come to bear so far, by reason; may be called from another thread."""
+        stats = self._session.stats()
+        return {
+            "dropped": 0,
+            "late": stats.late,
+            "rejected": stats.rejected,
+            "lost": sum(list(self.losses.counts.values())),
+        }
 
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
@@ -129,14 +159,7 @@ class Replay:
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         if stats.unknown_labels:
             result["unknown_labels"] = stats.unknown_labels
-        return result | {
-            "dropped": 0,
-            "late": stats.late,
-            "rejected": stats.rejected,
-            "saturated": stats.saturated,
-            "lost": sum(self.losses.counts.values()),
-            "interrupted": self.interrupted,
-        }
+        return result | self.drops() | {"saturated": stats.saturated, "interrupted": self.interrupted}
 
 
 def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterator[Packet | Label]:

@@ -38,8 +38,13 @@ class Section:
     parts: Sequence["str | Table | figure"]
 
 
-def require(library: str) -> None:
-    """Check that a library of the extra `plot` is there, before work is done that would be lost.
+def require(library: str, *, extra: str = "plot", what: str = "a picture") -> None:
+    """Check that a library of an extra is there, before work is done that would be lost.
+
+    Args:
+        library: as it is imported.
+        extra: which has it.
+        what: needs it.
 
     Raises:
         InputError: it is not.
@@ -47,7 +52,7 @@ def require(library: str) -> None:
     from importlib.util import find_spec
 
     if find_spec(library) is None:
-        raise InputError(f"a picture needs {library}, which is not there: pip install 'streamfeat[plot]'")
+        raise InputError(f"{what} needs {library}, which is not there: pip install 'streamfeat[{extra}]'")
 
 
 def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:

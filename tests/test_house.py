@@ -34,7 +34,7 @@ LAYERS = [
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
-    {"evaluate", "latency", "demo", "doctor"},
+    {"evaluate", "latency", "demo", "doctor", "view"},
     {"cli"},
 ]
 """A module may import from layers above its own line only; one that is new needs a place here."""
@@ -62,9 +62,11 @@ ROOMS = {
         {"cell", "page"},
         {"run"},
     ],
+    "view": [{"channels", "layout", "observe", "page", "pictures"}, {"sink"}, {"job"}],
     "cli": [
         {"options", "program"},
         {"evaluating", "learning", "live", "measuring", "recordings", "starting", "streaming"},
+        {"viewing"},
     ],
 }
 """The same inside packages that are one place in the layers."""
@@ -84,11 +86,13 @@ ONLY_IN = {
         "cli.measuring",
         "cli.starting",
         "cli.streaming",
+        "cli.viewing",
     },
     "hdrh": {"latency.histogram"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
     "pyarrow": {"table"},
+    "foxglove": {"view.channels"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch", "doctor"},
 }
 

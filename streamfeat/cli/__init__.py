@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from rich.markup import escape
 
-from streamfeat.cli import evaluating, learning, live, measuring, recordings, starting, streaming
+from streamfeat.cli import evaluating, learning, live, measuring, recordings, starting, streaming, viewing
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
@@ -24,6 +24,7 @@ __all__ = [
     "recordings",
     "starting",
     "streaming",
+    "viewing",
 ]
 
 

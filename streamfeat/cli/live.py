@@ -45,7 +45,7 @@ ConfigOption = Annotated[
 PortOption = Annotated[int, typer.Option(help="Loopback port where sessions meet; without --zenoh-config.")]
 
 
-def _names(key: str | None, ros2: str | None, domain: int) -> "Names":
+def names_of(key: str | None, ros2: str | None, domain: int) -> "Names":
     from streamfeat.live.names import PlainNames, RosNames
 
     if (key is None) == (ros2 is None):
@@ -98,7 +98,7 @@ def listen(
     for path in (output, json_lines):
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
-    names = _names(key, ros2, domain)
+    names = names_of(key, ros2, domain)
     job = Listen(
         names,
         model,
@@ -184,7 +184,7 @@ def record(
 
     refuse_existing(output, overwrite=overwrite)
     job = Record(
-        _names(key, ros2, domain),
+        names_of(key, ros2, domain),
         output,
         compression=compression,  # type: ignore[arg-type]
         chunk_s=chunk,

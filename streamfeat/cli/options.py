@@ -55,9 +55,7 @@ Stride = Annotated[
 Bins = Annotated[int | None, typer.Option(help="Time bins in the window.", show_default=_shown("bins"))]
 WindowMs = Annotated[
     float | None,
-    typer.Option(
-        help="Length of the window.", show_default="holds 95 % of labelled samples, or 100"
-    ),
+    typer.Option(help="Length of the window.", show_default="holds 95 % of labelled samples, or 100"),
 ]
 Downsample = Annotated[
     int | None,

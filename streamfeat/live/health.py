@@ -228,6 +228,21 @@ class Health:
         yield depth
         yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
 
+    def drops(self) -> dict[str, int]:
+        """What was not used, or was strange, by reason: packets, and (`late`, `rejected`) events."""
+        stats, delivery = self._cameras.stats(), self.delivery()
+        return {
+            "lost": delivery.lost,
+            "unheard": delivery.unheard,
+            "dropped": self._inbox.dropped,
+            "duplicates": delivery.duplicates,
+            "reordered": delivery.reordered,
+            "restarts": delivery.restarts,
+            "foreign": delivery.foreign,
+            "late": stats.late,
+            "rejected": stats.rejected,
+        }
+
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
         stats, delivery = self._cameras.stats(), self.delivery()
@@ -245,18 +260,7 @@ class Health:
         if stats.correct is not None and stats.samples:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
-        result |= {
-            "lost": delivery.lost,
-            "unheard": delivery.unheard,
-            "dropped": self._inbox.dropped,
-            "duplicates": delivery.duplicates,
-            "reordered": delivery.reordered,
-            "restarts": delivery.restarts,
-            "foreign": delivery.foreign,
-            "late": stats.late,
-            "rejected": stats.rejected,
-            "warnings": dict(sorted(self.reasons().items())),
-        }
+        result |= self.drops() | {"warnings": dict(sorted(self.reasons().items()))}
         for name, seconds in self._latest_end_to_end.percentiles():
             result[f"end_to_end_{name}_ms"] = round(1e3 * seconds, 3)
         return result

@@ -19,6 +19,7 @@ from streamfeat.classifier import Classifier
 from streamfeat.codecs import ENCODINGS, encode, make_decoder
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
+from streamfeat.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.live.health import Health, parse_address
@@ -60,6 +61,7 @@ class Listen:
         patience_s: how long packets may wait before readings are left out for them.
         max_delay_s: how long packets may wait before the oldest are dropped.
         console: for warnings.
+        engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -81,6 +83,7 @@ class Listen:
         patience_s: float = PATIENCE_S,
         max_delay_s: float = MAX_DELAY_S,
         console: Console | None = None,
+        engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = EmitPolicy.parse(emit)
@@ -93,6 +96,7 @@ class Listen:
         self._address = parse_address(metrics) if metrics else None
         self._names = names
         self._learn_online, self._reliable = learn_online, reliable
+        self._engine_of = engine_of
         self._zenoh_config, self._port = zenoh_config, port
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
@@ -111,6 +115,7 @@ class Listen:
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
         more: Sink[Emission] | None = None,
+        publish: bool = True,
     ) -> None:
         """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
 
@@ -120,6 +125,7 @@ class Listen:
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
             more: one sink more.
+            publish: put features and predictions on the network, beside the events.
 
         Raises:
             InputError: an output, the network or the metrics address cannot be used.
@@ -137,7 +143,7 @@ class Listen:
             screen if is_screen else nullcontext(),
         ):
             sinks = open_sinks(
-                partial(OutputSink, session, self._names, self.health.on_published),
+                partial(OutputSink, session, self._names, self.health.on_published) if publish else None,
                 partial(TerminalSink, console) if console and not is_screen else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
@@ -171,14 +177,23 @@ class Listen:
             make_decoder(encoding).decode(payload, base_ns)
         # In time and too late, however long compiling takes: the two ways to feed.
         for is_late in (False, True):
-            session = self._make_session("", lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
+            session = self._make_session("", Engine, lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
             for _ in session.process(Packet("", event, (side, side), 0, 0)):
                 pass
             session.rest()
             for _ in session.finish():
                 pass
 
-    def _make_session(self, topic: str, is_behind: Callable[[int], bool] | None = None) -> Session:
+    def drops(self) -> dict[str, int]:
+        """What did not come to bear so far, by reason; may be called from another thread."""
+        return self.health.drops()
+
+    def _make_session(
+        self,
+        topic: str,
+        engine: Callable[..., Engine] | None = None,
+        is_behind: Callable[[int], bool] | None = None,
+    ) -> Session:
         return Session(
             self._encoder,
             self._policy,
@@ -187,6 +202,7 @@ class Listen:
             clock=time.perf_counter,
             topic=topic,
             is_behind=is_behind or self._is_behind,
+            engine=engine or self._engine_of(topic),
         )
 
     def _is_behind(self, log_time_ns: int) -> bool:

@@ -7,7 +7,6 @@ Not here: reading (`recording`), pacing (`pipeline`), the network (`network`, `p
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,11 @@ from streamfeat.live.publisher import CameraSink
 from streamfeat.messages import EventPacket, LabelMessage
 from streamfeat.packets import Label, Packet, PacketWriter
 from streamfeat.pipeline import Pipeline, run_until_interrupted
-from streamfeat.recording import Recording, open_recording
+from streamfeat.recording import open_recording
 from streamfeat.sinks import open_sinks
 
 __all__ = ["Publish"]
 
-_LOOP_GAP_US = 1_000_000
 _POLL_S = 0.01
 
 
@@ -89,7 +87,7 @@ class Publish:
             pipelines: list[Pipeline[Packet | Label, EventPacket | LabelMessage]] = []
             for (path, topic), cutter, sink in zip(self._sources, self._cutters, self._sinks, strict=True):
                 _wait_for_readers(session, self._names.key(topic, EventPacket.SCHEMA_NAME), self._wait_s)
-                items = _items(recordings.enter_context(open_recording(path)), loop=self._loop)
+                items = recordings.enter_context(open_recording(path)).played(loop=self._loop)
                 pipelines.append(Pipeline(items, cutter, [sink], speed=self._speed))
             started = time.perf_counter()
             self.interrupted = run_until_interrupted(pipelines)
@@ -129,23 +127,6 @@ class _Cutter:
 
     def rest(self) -> None:
         pass
-
-
-def _items(recording: Recording, *, loop: bool) -> Iterator[Packet | Label]:
-    yield from recording.items()
-    if not loop or recording.first_us is None or recording.last_us is None:
-        return
-    step_us = recording.last_us - recording.first_us + _LOOP_GAP_US
-    shift_us = 0
-    while True:
-        shift_us += step_us
-        for item in recording.items():
-            if isinstance(item, Packet):
-                events = item.events.copy()
-                events["t"] += shift_us
-                yield replace(item, events=events)
-            else:
-                yield replace(item, start_us=item.start_us + shift_us)
 
 
 def _wait_for_readers(session: zenoh.Session, key: str, seconds: float) -> None:
