@@ -25,10 +25,8 @@ StreamItem = Packet | Label | Tick
 
 _TRACE = 32
 """Events whose features are held at a time under `event`."""
-
-_REST_COLUMNS = 4096
-"""Operator columns that are added at most while nothing waits: a fraction of a millisecond."""
-
+_AHEAD_COLUMNS = 4096
+"""Operator columns that are added at most to look ahead of a bin boundary: a fraction of a millisecond."""
 _AUTO_REST = 4.0
 """Under `auto`, time that passes after a reading, in multiples of what that reading took."""
 
@@ -103,6 +101,7 @@ class Session:
         self._classifier = classifier
         self._clock = clock
         self._topic = topic
+        self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
         self._every_event = policy == EmitPolicy("events", 1)
@@ -113,7 +112,7 @@ class Session:
         self._last_us = 0
         self._unread = 0
         self._next_us: int | None = None
-        self._rest_until = 0.0
+        self._rest_until = self._ahead_from = 0.0
         self._epoch: int | None = None
         self._silent_us = BEFORE_TIME
         self._incomplete_us = BEFORE_TIME
@@ -177,9 +176,11 @@ class Session:
             yield from self._feed(engine, events[end:], latest[end:])
 
     def rest(self) -> None:
-        """Nothing waits: bring the engine up to date, so that a reading that is due later costs less then."""
-        if self._engine and (self._unread or self._every_event) and self.policy.kind != "auto":
-            self._engine.prepare(_REST_COLUMNS)
+        """Nothing waits: bring the engine up to date for the next reading, for half of the time at most."""
+        now = self._clock()
+        if self._engine and self.policy.kind != "auto" and now >= self._ahead_from:
+            self._engine.prepare(_AHEAD_COLUMNS)
+            self._ahead_from = now + 2 * (self._clock() - now)
 
     def finish(self) -> Iterator[Emission]:
         """End the stream: the open sample is read, and what was collected is learned."""
@@ -297,8 +298,7 @@ class Session:
         )
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
-        engine.feed(events)
-        self._note(events, latest)
+        self._take(engine, events, latest)
         self._next_us = None
         now = self._clock()
         if now >= self._rest_until:
@@ -350,15 +350,8 @@ class Session:
             self._next_us = following
         return self._next_us
 
-    @property
-    def _window_us(self) -> int:
-        return self.encoder.geometry.window_us
-
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
         engine.feed(events)
-        self._note(events, latest)
-
-    def _note(self, events: Events, latest: NDArray[np.int64]) -> None:
         self._unread += len(events)
         self._last_us = max(self._last_us, int(latest[-1]))
 

@@ -28,6 +28,12 @@ def test_who_joins_late_has_lost_nothing():
     assert feed([5_000, 5_001], gid=b"")[0].stats == DeliveryStats(received=2)
 
 
+def test_what_we_dropped_first_was_heard():
+    delivery = Delivery()
+    assert delivery.see(ONE, 31, 0, dropped=20).lost == 20
+    assert delivery.stats == DeliveryStats(received=1, dropped=20, unheard=10)
+
+
 def test_a_gap_is_lost_and_breaks_decoders():
     delivery, verdicts = feed([1, 2, 6, 7])
     assert delivery.stats == DeliveryStats(received=4, lost=3)

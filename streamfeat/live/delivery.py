@@ -148,7 +148,7 @@ class Delivery:
         self._old.clear()
         self.stats.received += 1
         self.stats.lost += lost
-        self.stats.unheard += max(seq - 1, 0) if first and gid else 0
+        self.stats.unheard += max(seq - 1 - dropped, 0) if first and gid else 0
         self.stats.restarts += not first
         return Verdict(use=True, lost=lost + dropped, broken=not first, restarted=not first, anew=anew)
 

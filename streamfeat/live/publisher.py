@@ -88,7 +88,7 @@ class MessagePublisher:
                     key, encoding=encoding_of(schema), congestion_control=congestion, express=True
                 )
             self._open.append(self._publisher)
-            tokens, self._gid = _identity(session, names, topic, schema, entity)
+            tokens, self.gid = _identity(session, names, topic, schema, entity)
             self._open += [session.liveliness().declare_token(token) for token in tokens]
         except zenoh.ZError as error:
             self.close()
@@ -97,7 +97,7 @@ class MessagePublisher:
     def put(self, data: bytes) -> None:
         """Publish one message."""
         self.seq += 1
-        attachment = Attachment(self.seq, time.time_ns(), self._gid).pack()
+        attachment = Attachment(self.seq, time.time_ns(), self.gid).pack()
         self._publisher.put(data, attachment=attachment)
 
     def close(self) -> None:
