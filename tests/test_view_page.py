@@ -6,8 +6,10 @@ import socket
 import sys
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
 from live_net import PATIENCE_S, until
@@ -16,11 +18,12 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
+from streamfeat.emission import Emission
 from streamfeat.errors import InputError
 from streamfeat.view.channels import LiveBoard
 from streamfeat.view.job import View
 from streamfeat.view.page import PageServer, page
-from streamfeat.view.sink import about
+from streamfeat.view.sink import ViewSink, about
 from tools.browser import Browser, find_chromium
 
 MODEL = tiny.encoder(k=3)
@@ -218,3 +221,30 @@ def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
     finally:
         server.close()
         board.close()
+
+
+@needs_chromium
+@pytest.mark.parametrize("pooling", [1, 2, 3])
+def test_each_cell_has_its_bars(tab, pooling):
+    geometry = replace(tiny.GEOMETRY, patch=2, stride=2, pooling=pooling)
+    model = tiny.encoder(k=3, geometry=geometry)
+    features = np.arange(model.n_features, dtype=np.float32)
+    emission = Emission(1_000, 1, features, (), np.zeros(0, np.float32), None, False)
+    board = LiveBoard(about(model, ()), "test", 0)
+    server = PageServer(page(board.port), 0)
+    sink = ViewSink([board], model, rate=20, live=False, prefix=lambda topic: "/view", drops=dict)
+    board.announce("/view")
+    sink.write([emission])
+    try:
+        tab.open(f"http://127.0.0.1:{server.port}/")
+        tab.until("typeof model == 'object' && model.last.features")
+        tab.settle()
+        cells = tab.value("model.last.features.cells")
+        assert len(tab.value(f"{INK}('features')")) > 3
+        assert tab.value("model.scale") == tab.value(f"roundUp({features.max()})")
+        assert tab.problems == []
+    finally:
+        server.close()
+        board.close()
+    for cell, row in zip(cells, features.reshape(pooling**2, 2, -1), strict=True):
+        assert cell == {"positive": row[0].tolist(), "negative": row[1].tolist()}
