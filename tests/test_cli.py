@@ -432,7 +432,7 @@ REFUSALS = {
         [*NEW, "--patch", "1", "--bins", "1", "--filters", "1"],
         "are constant; there is no covariance to learn",
     ),
-    "preset": ([*NEW, "--preset", "fast"], "there is no preset 'fast'; choose from default, paper"),
+    "preset": ([*NEW, "--preset", "best"], "there is no preset 'best'; choose from default, fast, paper"),
     "weight of the other formulation": (
         [*NEW, "--formulation", "inverse", "--log-det", "0.1"],
         "log_det is a weight of the direct formulation",

@@ -242,7 +242,7 @@ def test_any_value_of_a_setting_can_be_swept(text, values):
         (["--on", "test"], "--on test is unknown; choose held-out or train"),
         (["--sweep", "encoding=loud"], "encoding is 'loud'"),
         (["--method", "counts", "--sweep", "bins=2"], "--sweep bins: none of counts uses it"),
-        (["--preset", "fast"], "there is no preset 'fast'"),
+        (["--preset", "best"], "there is no preset 'best'"),
         (["--early-samples", "-1"], "--early-samples -1"),
         (["--seed", "-1"], "seed is -1"),
         (["--report", "page.pdf"], "give a name that ends in .html"),

@@ -394,7 +394,7 @@ def test_a_real_recording_with_its_model(run, monkeypatch, steal):
     assert err.startswith("steal: 31 % of the processor time") if steal == 0.31 else err == ""
     assert out.startswith("digits: direct, split, K = 100")
     assert re.search(r"event +update +[1-9][\d,]* ", out)
-    assert "the first 500 events of each measurement" in out
+    assert "the first 500 events of each measurement" in " ".join(out.split())
     assert "% of events began a bin, with look-ahead" in out
     assert "Reading the clock costs" in out
 

@@ -192,7 +192,7 @@ def test_windows_end_where_the_resolution_changes():
 
 
 LEARN = {
-    "filters": 7, "patch": 4, "bins": 2, "window_ms": 100.0, "max_count": 2,
+    "filters": 7, "patch": 4, "stride": 4, "bins": 2, "window_ms": 100.0, "max_count": 2,
     "volumes": 200, "iterations": 2, "seed": 4,
 }  # fmt: skip
 """The geometry is `tiny.GEOMETRY`."""
@@ -285,7 +285,7 @@ def test_an_interruption_before_anything_was_learned_gives_no_encoder(recording)
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"stride": 2}, r"has geometry .*stride=4.* not .*stride=2"),
+        ({"stride": 3}, r"has geometry .*stride=4.* not .*stride=3"),
         ({"formulation": "inverse"}, "has formulation direct, not inverse"),
         ({"encoding": "soft"}, "has encoding split, not soft"),
         ({"threshold": 0.7}, "has threshold 0.5, not 0.7"),
@@ -342,8 +342,8 @@ def test_presets():
     paper = Setting(**preset_with("paper", {"filters": 100, "bins": None}))
     assert (paper.filters, paper.bins, paper.encoding) == (100, 7, "triangle")
     assert all(changes.keys() <= DEFAULTS.keys() for changes in PRESETS.values())
-    with pytest.raises(InputError, match="there is no preset 'fast'; choose from default, paper"):
-        preset_with("fast", {})
+    with pytest.raises(InputError, match="there is no preset 'best'; choose from default, fast, paper"):
+        preset_with("best", {})
 
 
 def test_a_recording_of_too_few_volumes_is_refused(tmp_path):
