@@ -391,6 +391,16 @@ def accounted(published: int | None, result: dict[str, Any]) -> dict[str, Any]:
     return {"published": published, "unaccounted": missing} | known
 
 
+def first_after(packets: list[tuple[float, bytes]], since: float, timeout: float) -> float:
+    """When the first packet came after a moment."""
+    limit = time.perf_counter() + timeout
+    while time.perf_counter() < limit:
+        if found := next((t for t, _ in list(packets) if t > since), None):
+            return found
+        time.sleep(0.01)
+    raise SystemExit("no packets come from the second publisher")
+
+
 def publisher_killed(arguments: argparse.Namespace) -> dict[str, Any]:
     """kill -9 of the publisher, and another in its place."""
     port = ["--port", arguments.port]
@@ -405,18 +415,18 @@ def publisher_killed(arguments: argparse.Namespace) -> dict[str, Any]:
             first.kill()
         killed = time.perf_counter()
         with playing(arguments, *port) as second:
-            recovered = reader.next_after(killed + 0.2, 60)
-            began = next(t for t, _ in packets if t > killed + 0.2)
+            # What is read in between is a window that empties: what counts comes after a packet.
+            began = first_after(packets, killed + 0.2, 60)
+            recovered = reader.next_after(began, 60)
             time.sleep(2)
             second.send_signal(signal.SIGINT)
             second.communicate(timeout=30)
         time.sleep(0.5)
         watch.undeclare()
         result = finish(one)
-    after = None if recovered is None else killed + 0.2 + recovered
     return {
-        "from_first_packet_s": None if after is None else round(after - began, 3),
-        "from_kill_s": None if after is None else round(after - killed, 3),
+        "from_first_packet_s": None if recovered is None else round(recovered, 3),
+        "from_kill_s": None if recovered is None else round(began + recovered - killed, 3),
         "seen_by_another_reader": len(packets),
     } | accounted(None, result)
 
