@@ -58,6 +58,8 @@ def browser():
 
 @pytest.fixture
 def tab(browser):
+    browser.open("about:blank")  # what was shown before tries to connect again
+    browser.until("location.href == 'about:blank'")
     browser.requests.clear()
     browser.problems.clear()
     browser.resize(1280, 900)
