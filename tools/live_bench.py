@@ -324,21 +324,26 @@ def at_rate(arguments: argparse.Namespace, rate: float, seconds: float, emit: st
 
 
 def rate(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The highest rate at which nothing is lost, and ten times that."""
-    asked, best = arguments.first_rate, None
-    while asked < 2e8:
-        tried = at_rate(arguments, asked, 3.0)
+    """The highest rate at which nothing is lost for as long as asked, and ten times that for ten seconds."""
+    asked = arguments.first_rate
+    while asked < 2e8 and is_whole(tried := at_rate(arguments, asked, 3.0)):
         print(json.dumps({"try": tried}), flush=True)
-        missing = tried["lost"] + tried["dropped"] + tried["unaccounted"]
-        if missing or tried["sent_events_per_s"] < 0.95 * asked:
-            break
-        best, asked = asked, asked * 1.5
-    if best is None:
-        return {"none": tried}
-    return {
-        "highest": at_rate(arguments, best * 0.9, arguments.seconds),
-        "ten times": at_rate(arguments, best * 9, min(arguments.seconds, 10)),
-    }
+        asked *= 1.5
+    # What is carried for seconds need not be carried for a minute.
+    while asked > 1e4:
+        asked *= 0.6
+        long = at_rate(arguments, asked, arguments.seconds)
+        if is_whole(long):
+            ten_times = at_rate(arguments, asked * 10, min(arguments.seconds, 10))
+            return {"highest": long, "ten times": ten_times}
+        print(json.dumps({"try": long}), flush=True)
+    return {"none": long}
+
+
+def is_whole(tried: dict[str, Any]) -> bool:
+    """Whether all that was asked for was sent, and all that was sent was used."""
+    missing = tried["lost"] + tried["dropped"] + tried["unaccounted"]
+    return not missing and tried["sent_events_per_s"] >= 0.95 * tried["asked_events_per_s"]
 
 
 def client(folder: Path, port: int, name: str) -> Path:
