@@ -76,6 +76,8 @@ class Board:
 
     def __init__(self, about: Mapping[str, str]) -> None:
         """No channel before there is something to say."""
+        # It would say of each client that leaves without a word that it is an error. Only the first call counts.
+        foxglove.set_log_level("CRITICAL")
         self._context = foxglove.Context()
         self._about = dict(about)
         self._channels: dict[str, dict[str, RawImageChannel | foxglove.Channel]] = {}
@@ -157,8 +159,6 @@ class LiveBoard(Board):
         """Start the server."""
         super().__init__(about)
         self._on_viewer = on_viewer
-        # It would say of each client that leaves without a word that it is an error.
-        foxglove.set_log_level("CRITICAL")
         try:
             self._server = foxglove.start_server(
                 name=name,
