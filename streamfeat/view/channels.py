@@ -76,7 +76,7 @@ class Board:
 
     def __init__(self, about: Mapping[str, str]) -> None:
         """No channel before there is something to say."""
-        # It would say of each client that leaves without a word that it is an error. Only the first call counts.
+        # It calls each client that leaves without a word an error. Only the first call counts.
         foxglove.set_log_level("CRITICAL")
         self._context = foxglove.Context()
         self._about = dict(about)
