@@ -12,7 +12,7 @@ from pathlib import Path
 from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console
 
-from streamfeat import cli
+from streamfeat.cli import program
 from streamfeat.replay import Replay
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -32,8 +32,8 @@ def main() -> None:
         speed="20",
     )
     job.run(console=console)
-    cli.out = console
-    cli.print_result(job.result(), "replayed", as_json=False)
+    program.out = console
+    program.print_result(job.result(), "replayed", as_json=False)
     # Without the web fonts that rich would ask for: the picture makes no request.
     plain = re.sub(r"@font-face {{.*?}}\s*", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL)
     PICTURE.write_text(console.export_svg(title=COMMAND, code_format=plain))
