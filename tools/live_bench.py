@@ -40,7 +40,6 @@ FRAME = (100, 120)
 """All samples are shown on one sensor of this size."""
 PROGRAM = [sys.executable, "-c", "from streamfeat.cli import main; main()"]
 KEY = "bench/cam/events"
-CUT_S = 5.0
 
 ECHO = """
 import sys, zenoh
@@ -470,13 +469,13 @@ def router_killed(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def subscriber_stopped(arguments: argparse.Namespace) -> dict[str, Any]:
-    """SIGSTOP of the listener for five seconds."""
+    """SIGSTOP of the listener for some seconds."""
     with open_session(port=arguments.port) as session, listener(arguments, "--emit", "10ms") as (one, _):
         reader = Reader(session)
         with playing(arguments, "--port", arguments.port) as camera:
             steady(reader)
             one.send_signal(signal.SIGSTOP)
-            time.sleep(CUT_S)
+            time.sleep(arguments.cut)
             on = time.perf_counter()
             one.send_signal(signal.SIGCONT)
             recovered = reader.next_after(on, 30)
@@ -489,7 +488,7 @@ def subscriber_stopped(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def network_cut(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The camera's network namespace is cut off for five seconds."""
+    """The camera's network namespace is cut off for some seconds."""
     space, outside, inside = "sfbench", "sfb0", "sfb1"
     setup = [
         f"ip netns add {space}",
@@ -528,7 +527,7 @@ def network_cut(arguments: argparse.Namespace) -> dict[str, Any]:
         camera = stack.enter_context(playing(arguments, "--zenoh-config", there, prefix=into))
         steady(reader)
         subprocess.run(["ip", "-n", space, "link", "set", inside, "down"], check=True)
-        time.sleep(CUT_S)
+        time.sleep(arguments.cut)
         subprocess.run(["ip", "-n", space, "link", "set", inside, "up"], check=True)
         up = time.perf_counter()
         recovered = reader.next_after(up + 0.05, 30)
@@ -558,6 +557,7 @@ def main() -> None:
     parser.add_argument("-m", "--model", type=Path, required=True)
     parser.add_argument("-r", "--recording", type=Path, required=True)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--cut", type=float, default=5.0, help="seconds of SIGSTOP, and of the cut")
     parser.add_argument("--first-rate", type=float, default=500_000)
     parser.add_argument("--port", type=int, default=17470)
     arguments = parser.parse_args()

@@ -1,0 +1,36 @@
+"""What `tools/live_bench.py` does to real processes, for a shorter time: they come back, and all is accounted for."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import pytest
+from live_net import compiled, free_port
+from test_live_listen import MODEL
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT))
+
+from tools import live_bench  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    MODEL.save(folder / "model")
+    compiled(folder)
+    return argparse.Namespace(
+        model=folder / "model", recording=ROOT / "recordings" / "digits_test.mcap", cut=1.0, port=0
+    )
+
+
+@pytest.mark.parametrize("fault", [live_bench.subscriber_stopped, live_bench.network_cut])
+def test_it_comes_back_by_itself_with_true_counts(arguments, fault):
+    arguments.port = free_port()
+    result = fault(arguments)
+    if "skipped" in result:
+        pytest.skip(result["skipped"])
+    assert result["recovered_s"] is not None
+    assert result["packets"] > 0
+    assert result["unaccounted"] == 0
+    assert (result["duplicates"], result["foreign"], result["restarts"]) == (0, 0, 0)
