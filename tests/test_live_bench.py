@@ -1,4 +1,4 @@
-"""What `tools/live_bench.py` does to real processes, for a shorter time: they come back, and all is accounted for."""
+"""What `tools/live_bench.py` does to real processes, but shorter: they come back, all is accounted for."""
 
 import argparse
 import sys
