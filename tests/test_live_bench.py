@@ -1,4 +1,4 @@
-"""What `tools/live_bench.py` does to real processes, but shorter: they come back, all is accounted for."""
+"""What `tools/live_bench` does to real processes, but shorter: they come back, all is accounted for."""
 
 import argparse
 import sys
@@ -11,7 +11,7 @@ from test_live_listen import MODEL
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT))
 
-from tools import live_bench  # noqa: E402
+from tools.live_bench import faults  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def arguments(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize("fault", [live_bench.subscriber_stopped, live_bench.network_cut])
+@pytest.mark.parametrize("fault", [faults.subscriber_stopped, faults.network_cut])
 def test_it_comes_back_by_itself_with_true_counts(arguments, fault):
     arguments.port = free_port()
     result = fault(arguments)
