@@ -56,12 +56,17 @@ _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
 class _InOrder(TyperGroup):
-    """Commands in the order in which somebody new needs them, not in that of imports."""
+    """Commands in the order in which somebody new needs them, each with its whole first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
         known = [*_ORDER, *(name for name in names if name not in _ORDER + _LAST), *_LAST]
         return [name for name in known if name in names]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        rows = [(name, self.commands[name].get_short_help_str(200)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 app = typer.Typer(
@@ -69,7 +74,7 @@ app = typer.Typer(
     cls=_InOrder,
     help="Learned features from event cameras: event by event, exact, and never behind.",
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,  # plain pages: for others Typer imports a parser of Markdown, a third of a start
     pretty_exceptions_enable=False,
 )
 
