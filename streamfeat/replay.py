@@ -99,6 +99,7 @@ class Replay:
         table: Path | None = None,
         more: Sink[Emission] | None = None,
         loop: bool = False,
+        report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
     ) -> None:
         """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
 
@@ -111,6 +112,8 @@ class Replay:
             table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
             more: one sink more.
             loop: start again at the end, with times that go on.
+            report: called with (step, done, of how many, remark) as packets and labels are read, from a
+                thread.
         """
         with open_recording(self._recording, self._topic) as rec:
             self._played = rec
@@ -121,7 +124,8 @@ class Replay:
                 partial(TableSink, table, *self._shape_of_emissions) if table else None,
                 (lambda: more) if more else None,
             )
-            items = items_of_split(rec.played(loop=loop), self._split)
+            played = rec.played(loop=loop, report=lambda n, total: report("replaying", n, total, ""))
+            items = items_of_split(played, self._split)
             pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
                 items, self._session, sinks, speed=self._speed
             )

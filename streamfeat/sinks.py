@@ -201,13 +201,13 @@ class TerminalSink:
 
     def _line(self, e: Emission) -> Text:
         line = Text()
-        line.append(f"{e.t_us / 1e6:9.2f} s ", style="dim")
+        line.append(f"{e.t_us / 1e6:8.2f} s ", style="dim")
         if e.topic:
             line.append(f"{e.topic}  ", style="cyan")
-        line.append(f"{e.n_events:>11,} events  ")
+        line.append(f"{e.n_events:>10,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
-            line.append(f"{e.prediction:<10}", style="bold")
+            line.append(f"{e.prediction:<{max(map(len, e.labels))}}", style="bold")
             line.append(f" {first - second:+6.2f}  ", style="dim")
         if e.sample and e.final:
             if e.correct is None:

@@ -3,11 +3,13 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -142,6 +144,42 @@ def test_no_line_is_wider_than_a_terminal_of_sixty_columns(tmp_path):
     assert "/s" in plain
     assert max(map(len, re.split(r"[\r\n]+", plain))) <= 60
     assert "3/3" not in in_a_terminal(tmp_path, "convert", "in", "quiet.mcap", "--quiet")[1]
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    """What a replay of two samples needs."""
+    folder = tmp_path_factory.mktemp("replay")
+    model = tiny.encoder()
+    model.save(folder / "model")
+    tiny.classifier(model).save(folder / "classifier")
+    tiny.write_items(folder / "two.mcap", tiny.labelled_items(2))
+    return folder
+
+
+def test_lines_of_a_replay_stand_above_its_bar(replayed):
+    words = ["replay", "two.mcap", "-m", "model", "-c", "classifier", "--verbose", "--speed", "2"]
+    status, written = in_a_terminal(replayed, *words)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written)
+    assert status == 0
+    lines = re.split(r"[\r\n]+", plain)
+    assert max(map(len, lines)) <= 60
+    assert sum(" % of " in line for line in lines) == 2
+    assert not any(" % of " in line and "replaying" in line for line in lines)
+    assert any("replaying" in line and "6/6" in line for line in lines)  # packets and labels
+
+
+def test_what_goes_to_a_file_while_a_bar_is_shown_is_in_the_file(replayed):
+    process = [*COMMAND, "replay", "two.mcap", "-m", "model", "--json-lines", "-", "--emit", "1s"]
+    script = f"{shlex.join(process)} > lines"
+    leader, follower = pytest.importorskip("pty").openpty()
+    with os.fdopen(leader, "rb"), os.fdopen(follower, "wb"):
+        done = subprocess.run(
+            ["sh", "-c", script], stdin=follower, stderr=follower, cwd=replayed, check=False, timeout=120
+        )
+    assert done.returncode == 0
+    lines = (replayed / "lines").read_text().splitlines()
+    assert len([json.loads(line) for line in lines]) >= 2
 
 
 def test_output_that_is_no_terminal_has_neither_colour_nor_bars(tmp_path):
