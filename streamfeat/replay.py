@@ -17,6 +17,7 @@ from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.errors import InputError
+from streamfeat.events import make_events
 from streamfeat.mcap_records import Losses
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
@@ -25,7 +26,7 @@ from streamfeat.session import Session
 from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
 from streamfeat.table import TableSink
 
-__all__ = ["Replay", "items_of_split", "parse_speed"]
+__all__ = ["Replay", "items_of_split", "parse_speed", "warm_up"]
 
 
 class Replay:
@@ -174,6 +175,16 @@ def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterat
             wanted = item.split == split
         if wanted:
             yield item
+
+
+def warm_up(encoder: Encoder, policy: EmitPolicy) -> None:
+    """Compile what the first packets would otherwise have to wait for."""
+    session = Session(encoder, policy)
+    side = encoder.geometry.patch * encoder.geometry.downsample
+    for _ in session.process(Packet("", make_events([0], [0], [1], [0]), (side, side), 0, 0)):
+        pass
+    for _ in session.finish():
+        pass
 
 
 def _recording_sink(path: Path) -> RecordingSink:

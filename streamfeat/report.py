@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from streamfeat.errors import InputError
-from streamfeat.files import replacing
+from streamfeat.files import write_atomically
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure
@@ -85,8 +85,7 @@ def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
                 body.append(f'<div class="figure">{next(waiting)}</div>')
     drawing = Resources(mode="inline", components=["bokeh"]).render_js() if figures else ""
     page = _PAGE.format(title=escape(title), body="\n".join(body), drawing=drawing, script=script)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_atomically(path, page.encode())
 
 
 def _table(table: Table) -> str:

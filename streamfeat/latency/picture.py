@@ -4,6 +4,7 @@ Lives here: percentile curves, latency over stream time.
 Not here: measuring (`measure`), numbers as text (`words`), the skeleton of a page (`streamfeat.report`).
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.files import replacing
+from streamfeat.files import write_atomically
 from streamfeat.latency.measure import LatencyReport, Row
 from streamfeat.latency.update import Walk
 from streamfeat.latency.words import COLUMNS, cells, describe, notes
@@ -243,5 +244,6 @@ def _draw_image(path: Path, report: LatencyReport) -> None:
         below.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)
     for axis in axes:
         axis.grid(alpha=0.3)
-    with replacing(path) as temporary:
-        image.savefig(temporary, format="png")
+    picture = io.BytesIO()
+    image.savefig(picture, format="png")
+    write_atomically(path, picture.getvalue())
