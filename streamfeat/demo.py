@@ -153,7 +153,8 @@ class Demo:
             f"streamfeat replay {test} -m {model} -c {classifier} --emit event",
             f"streamfeat latency {test} -m {model}",
             f"streamfeat evaluate {train} {test} --method direct --method counts --patch {_SETTING.patch} "
-            f"--max-count {_SETTING.max_count} --filters {_SETTING.filters} --volumes {_SETTING.volumes}",
+            f"--max-count {_SETTING.max_count} --filters {_SETTING.filters} --volumes {_SETTING.volumes} "
+            f"--iterations {_SETTING.iterations}",
         ]
 
 

@@ -71,6 +71,10 @@ def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
     from bokeh.resources import Resources
 
     figures = [part for section in sections for part in section.parts if not isinstance(part, str | Table)]
+    for each in figures:
+        # As wide as the page, which may be a narrow one; buttons are for who points at it, not for print.
+        each.sizing_mode = "stretch_width"
+        each.toolbar.logo, each.toolbar.autohide = None, True
     script, frames = components(figures) if figures else ("", ())
     waiting = iter(frames)
     body = []
@@ -110,13 +114,14 @@ _PAGE = """<!DOCTYPE html>
 body {{ font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 1100px;
   margin: 2rem auto; padding: 0 1rem; }}
 h1 {{ font-size: 1.6rem; }}
-h2 {{ font-size: 1.2rem; margin-top: 2rem; break-after: avoid; }}
+h2 {{ font-size: 1.2rem; margin-top: 2rem; }}
+h2, p:has(+ .figure), table:has(+ .figure) {{ break-after: avoid; }}
 table {{ border-collapse: collapse; font-size: 13px; margin: 1rem 0; }}
 th {{ text-align: left; border-bottom: 2px solid #888; }}
 td {{ border-bottom: 1px solid #ddd; }}
 th, td {{ padding: 0.2rem 0.6rem; white-space: nowrap; }}
 .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.figure, tr {{ break-inside: avoid; }}
+.figure, table {{ break-inside: avoid; }}
 @media print {{ body {{ max-width: none; margin: 0; font-size: 11px; }} table {{ font-size: 9px; }}
   th, td {{ padding: 0.1rem 0.3rem; }} }}
 </style>

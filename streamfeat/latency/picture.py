@@ -139,7 +139,6 @@ def _curves_of_page(report: LatencyReport) -> "figure":
     from bokeh.plotting import figure
 
     plot = figure(
-        width=1060,
         height=520,
         x_axis_type="log",
         y_axis_type="log",
@@ -166,7 +165,6 @@ def _cloud_of_page(walk: Walk) -> "figure":
     from bokeh.plotting import figure
 
     plot = figure(
-        width=1060,
         height=340,
         y_axis_type="log",
         x_axis_label=_TIME_AXIS,
