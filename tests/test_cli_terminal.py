@@ -220,3 +220,13 @@ def test_one_file_that_cannot_be_read_leaves_no_recording(tmp_path):
     assert isinstance(done.exception, cli.InputError)
     assert "none of the 2 samples can be read" in str(done.exception)
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_predicting_does_not_wait_for_scikit_learn():
+    code = "import sys, streamfeat.replay, streamfeat.live.listen; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    loaded = set(done.stdout.split())
+    assert "streamfeat.classifier" in loaded
+    assert not loaded & {"sklearn", "pandas", "bokeh", "pyarrow", "foxglove"}
