@@ -2,6 +2,9 @@
 
 Lives here: normalising pooled features, training with cross-validation, saving, predicting, updating.
 Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
+
+Predicting needs NumPy alone; scikit-learn is imported where something is learned, for that takes longer than
+all else before a first prediction.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,14 +14,10 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.linear_model import SGDClassifier
-from sklearn.model_selection import StratifiedGroupKFold
-from sklearn.preprocessing import StandardScaler
 
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.safe_arrays import read_safetensors, write_safetensors
-from streamfeat.svm import LinearSVM
 
 __all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
 
@@ -206,6 +205,11 @@ def train_classifier(
     Raises:
         InputError: labels are missing, fewer than two classes, or a class with fewer samples than folds.
     """
+    from sklearn.model_selection import StratifiedGroupKFold
+    from sklearn.preprocessing import StandardScaler
+
+    from streamfeat.svm import LinearSVM
+
     missing = [i for i, label in enumerate(labels) if not (isinstance(label, str) and label)]
     if missing:
         raise InputError(
@@ -298,6 +302,8 @@ class OnlineClassifier:
 
     def __init__(self, start: Classifier, *, rate: float = 0.01, batch_size: int = 16, seed: int = 0) -> None:
         """Start from the weights of `start`."""
+        from sklearn.linear_model import SGDClassifier
+
         self.classifier = start
         self.batch_size = batch_size
         self.learned = 0

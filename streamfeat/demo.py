@@ -16,6 +16,7 @@ from rich.console import Console
 from streamfeat.classifier import Classifier, train_classifier
 from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
+from streamfeat.events import make_events
 from streamfeat.features import encode_samples
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.setting import Setting
@@ -23,6 +24,7 @@ from streamfeat.packets import Packet
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label, open_recording
+from streamfeat.replay import warm_up
 from streamfeat.session import Session
 from streamfeat.simulate import CameraModel, digit_samples
 from streamfeat.sinks import Sink, TerminalSink
@@ -39,8 +41,9 @@ SIZES = {"train": 200, "test": 40}
 _SAMPLE_US, _GAP_US = 300_000, 300_000
 """A sample is three saccades; the silence after it is one window."""
 _SETTING = Setting(patch=10, max_count=2, window_ms=300, filters=64, volumes=4_000, iterations=6)
-_SPEED = 3.0
-"""Stream seconds for each second of the live view: its forty digits take eight."""
+_POLICY = EmitPolicy.parse("10ms")
+_SPEED = 4.0
+"""Stream seconds for each second of the live view: its forty digits take six."""
 
 Report = Callable[[str, int, int, str], None]
 
@@ -89,6 +92,15 @@ class Demo:
         encoder.save(self.model)
         return encoder
 
+    def compile(self, encoder: Encoder) -> None:
+        """Compile what encoding and replaying would otherwise wait for, without a word, when first needed."""
+        remark = "kernels, kept for the next time"
+        self._report("compiling", 0, 2, remark)
+        encoder.encode(make_events([0], [0], [1], [0]), CameraModel().resolution)
+        self._report("compiling", 1, 2, remark)
+        warm_up(encoder, _POLICY)
+        self._report("compiling", 2, 2, remark)
+
     def fit(self, encoder: Encoder) -> Classifier:
         """Train a classifier on the labelled samples of the training recording."""
         features, labels = [], []
@@ -108,7 +120,7 @@ class Demo:
 
         A console that is no terminal, or one too narrow, gets lines. Without one nothing waits for the clock.
         """
-        session = Session(encoder, EmitPolicy.parse("10ms"), classifier, clock=time.perf_counter)
+        session = Session(encoder, _POLICY, classifier, clock=time.perf_counter)
         with open_recording(self.test) as recording:
             view = (
                 TerminalView(console, recording.resolution)
@@ -140,7 +152,9 @@ class Demo:
         return [
             f"streamfeat replay {test} -m {model} -c {classifier} --emit event",
             f"streamfeat latency {test} -m {model}",
-            f"streamfeat evaluate {train} {test} --patch 8 --filters 50 --method direct --method counts",
+            f"streamfeat evaluate {train} {test} --method direct --method counts --patch {_SETTING.patch} "
+            f"--max-count {_SETTING.max_count} --filters {_SETTING.filters} --volumes {_SETTING.volumes} "
+            f"--iterations {_SETTING.iterations}",
         ]
 
 

@@ -5,7 +5,7 @@ Lives here: `RecordingWriter`; cutting batches into packets, and never leaving h
 Not here: reading (`streamfeat.recording`), what bytes a message has (`streamfeat.messages`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -34,13 +34,21 @@ _COMPRESSION = {
 _Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
 
 
-def recover(source: str | PathLike[str], target: str | PathLike[str], *, overwrite: bool = False) -> Losses:
+def recover(
+    source: str | PathLike[str],
+    target: str | PathLike[str],
+    *,
+    overwrite: bool = False,
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
+) -> Losses:
     """Copy every message of any topic that can be read into a new, intact recording.
 
     Args:
         source: the damaged or unfinished file, not changed.
         target: the file to write.
         overwrite: whether an existing file at `target` may be replaced.
+        report: called with (step, messages, of how many, remark) after each message; of how many is 0 where
+            the source does not say.
 
     Returns:
         What could not be read.
@@ -52,8 +60,11 @@ def recover(source: str | PathLike[str], target: str | PathLike[str], *, overwri
     # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
     writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
     with writer, open_mcap(Path(source)) as file:
-        for _, channel, schema, message in iter_messages(file, read_summary(file), losses):
+        summary = read_summary(file)
+        total = sum(summary.message_counts.values()) if summary else 0
+        for done, (_, channel, schema, message) in enumerate(iter_messages(file, summary, losses), 1):
             writer._copy(channel, schema, message)
+            report("recovering", done, total, "")
     return losses
 
 

@@ -9,7 +9,7 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
@@ -196,9 +196,22 @@ class Recording:
         for channel_id in self._expected:
             self._count_missing(channel_id, seen[channel_id], losses)
 
-    def played(self, *, loop: bool) -> Iterator[Packet | Label]:
-        """As `items`, and with `loop` again and again, a second after the end, with times that go on."""
-        yield from self.items()
+    def played(
+        self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
+    ) -> Iterator[Packet | Label]:
+        """As `items`, and with `loop` again and again, a second after the end, with times that go on.
+
+        Args:
+            loop: go on for ever.
+            report: told, with each item of the first time, how many there have been and how many there are;
+                0 if that is unknown.
+        """
+        wanted = {*EVENT_SCHEMAS, LabelMessage.SCHEMA_NAME}
+        topics = [t for t in self.topics if t.schema in wanted]
+        total = sum(t.n_messages for t in topics if t.name == self.topic or t.schema not in EVENT_SCHEMAS)
+        for done, item in enumerate(self.items(), 1):
+            yield item
+            report(done, 0 if loop else total)
         if not loop or self.first_us is None or self.last_us is None:
             return
         step_us = self.last_us - self.first_us + _LOOP_GAP_US

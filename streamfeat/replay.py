@@ -17,6 +17,7 @@ from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.errors import InputError
+from streamfeat.events import make_events
 from streamfeat.mcap_records import Losses
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
@@ -25,7 +26,7 @@ from streamfeat.session import Session
 from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
 from streamfeat.table import TableSink
 
-__all__ = ["Replay", "items_of_split", "parse_speed"]
+__all__ = ["Replay", "items_of_split", "parse_speed", "warm_up"]
 
 
 class Replay:
@@ -99,6 +100,7 @@ class Replay:
         table: Path | None = None,
         more: Sink[Emission] | None = None,
         loop: bool = False,
+        report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
     ) -> None:
         """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
 
@@ -111,6 +113,8 @@ class Replay:
             table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
             more: one sink more.
             loop: start again at the end, with times that go on.
+            report: called with (step, done, of how many, remark) as packets and labels are read, from a
+                thread.
         """
         with open_recording(self._recording, self._topic) as rec:
             self._played = rec
@@ -121,7 +125,8 @@ class Replay:
                 partial(TableSink, table, *self._shape_of_emissions) if table else None,
                 (lambda: more) if more else None,
             )
-            items = items_of_split(rec.played(loop=loop), self._split)
+            played = rec.played(loop=loop, report=lambda n, total: report("replaying", n, total, ""))
+            items = items_of_split(played, self._split)
             pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
                 items, self._session, sinks, speed=self._speed
             )
@@ -170,6 +175,16 @@ def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterat
             wanted = item.split == split
         if wanted:
             yield item
+
+
+def warm_up(encoder: Encoder, policy: EmitPolicy) -> None:
+    """Compile what the first packets would otherwise have to wait for."""
+    session = Session(encoder, policy)
+    side = encoder.geometry.patch * encoder.geometry.downsample
+    for _ in session.process(Packet("", make_events([0], [0], [1], [0]), (side, side), 0, 0)):
+        pass
+    for _ in session.finish():
+        pass
 
 
 def _recording_sink(path: Path) -> RecordingSink:

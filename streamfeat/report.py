@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from streamfeat.errors import InputError
-from streamfeat.files import replacing
+from streamfeat.files import write_atomically
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure
@@ -71,6 +71,10 @@ def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
     from bokeh.resources import Resources
 
     figures = [part for section in sections for part in section.parts if not isinstance(part, str | Table)]
+    for each in figures:
+        # As wide as the page, which may be a narrow one; buttons are for who points at it, not for print.
+        each.sizing_mode = "stretch_width"
+        each.toolbar.logo, each.toolbar.autohide = None, True
     script, frames = components(figures) if figures else ("", ())
     waiting = iter(frames)
     body = []
@@ -85,8 +89,7 @@ def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
                 body.append(f'<div class="figure">{next(waiting)}</div>')
     drawing = Resources(mode="inline", components=["bokeh"]).render_js() if figures else ""
     page = _PAGE.format(title=escape(title), body="\n".join(body), drawing=drawing, script=script)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_atomically(path, page.encode())
 
 
 def _table(table: Table) -> str:
@@ -111,13 +114,14 @@ _PAGE = """<!DOCTYPE html>
 body {{ font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 1100px;
   margin: 2rem auto; padding: 0 1rem; }}
 h1 {{ font-size: 1.6rem; }}
-h2 {{ font-size: 1.2rem; margin-top: 2rem; break-after: avoid; }}
+h2 {{ font-size: 1.2rem; margin-top: 2rem; }}
+h2, p:has(+ .figure), table:has(+ .figure) {{ break-after: avoid; }}
 table {{ border-collapse: collapse; font-size: 13px; margin: 1rem 0; }}
 th {{ text-align: left; border-bottom: 2px solid #888; }}
 td {{ border-bottom: 1px solid #ddd; }}
 th, td {{ padding: 0.2rem 0.6rem; white-space: nowrap; }}
 .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.figure, tr {{ break-inside: avoid; }}
+.figure, table {{ break-inside: avoid; }}
 @media print {{ body {{ max-width: none; margin: 0; font-size: 11px; }} table {{ font-size: 9px; }}
   th, td {{ padding: 0.1rem 0.3rem; }} }}
 </style>

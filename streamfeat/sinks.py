@@ -6,8 +6,8 @@ Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`)
 
 import json
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol, TextIO, TypeVar
 
@@ -99,22 +99,42 @@ class JsonLinesSink:
             raise InputError(f"{target}: cannot write there: {error.strerror}") from error
 
     def write(self, emissions: Sequence[Emission]) -> None:
-        """Write a line for each emission."""
+        """Write a line for each emission.
+
+        Raises:
+            InputError: the disk is full, or whatever else keeps the target from being written.
+        """
         lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
-        self._stream.writelines(lines)  # type: ignore[union-attr]
-        if self._path is None:
-            self._stream.flush()  # type: ignore[union-attr]
+        with self._explaining():
+            self._stream.writelines(lines)  # type: ignore[union-attr]
+            if self._path is None:
+                self._stream.flush()  # type: ignore[union-attr]
 
     def close(self, *, failed: bool) -> None:
-        """Put the file in its place, or remove it."""
+        """Put the file in its place, or remove it.
+
+        Raises:
+            InputError: as for `write`; the file is removed then.
+        """
         if self._path is None or self._part is None:
-            self._stream.flush()  # type: ignore[union-attr]
-            return
-        self._stream.close()  # type: ignore[union-attr]
-        if failed:
+            return  # each write was flushed
+        try:
+            with suppress(OSError) if failed else self._explaining():
+                self._stream.close()  # type: ignore[union-attr]
+            if not failed:
+                self._part.replace(self._path)
+        finally:
             self._part.unlink(missing_ok=True)
-        else:
-            self._part.replace(self._path)
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            raise  # who reads has enough, as `head` has: no fault of anybody's
+        except OSError as error:
+            where = self._path or "standard output"
+            raise InputError(f"{where}: cannot be written: {error.strerror}; is there room?") from None
 
 
 class RecordingSink:
@@ -201,13 +221,13 @@ class TerminalSink:
 
     def _line(self, e: Emission) -> Text:
         line = Text()
-        line.append(f"{e.t_us / 1e6:9.2f} s ", style="dim")
+        line.append(f"{e.t_us / 1e6:8.2f} s ", style="dim")
         if e.topic:
             line.append(f"{e.topic}  ", style="cyan")
-        line.append(f"{e.n_events:>11,} events  ")
+        line.append(f"{e.n_events:>10,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
-            line.append(f"{e.prediction:<10}", style="bold")
+            line.append(f"{e.prediction:<{max(map(len, e.labels))}}", style="bold")
             line.append(f" {first - second:+6.2f}  ", style="dim")
         if e.sample and e.final:
             if e.correct is None:

@@ -6,7 +6,8 @@ Not here: other sinks (`sinks`), and features of samples in memory (`features`).
 
 import importlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,23 +57,42 @@ class TableSink:
             self._writer = self._pa.ipc.new_file(self._file, self._schema)
 
     def write(self, emissions: Sequence[Emission]) -> None:
-        """Keep the emissions until there are enough for a group of rows."""
+        """Keep the emissions until there are enough for a group of rows.
+
+        Raises:
+            InputError: the disk is full, or whatever else keeps the file from being written.
+        """
         self._waiting += emissions
         if len(self._waiting) * self._n_features * 4 >= _GROUP_BYTES:
-            self._write_group()
+            with self._explaining():
+                self._write_group()
 
     def close(self, *, failed: bool) -> None:
-        """Put the file in its place, or remove it."""
+        """Put the file in its place, or remove it.
+
+        Raises:
+            InputError: as for `write`; the file is removed then.
+        """
         try:
-            if not failed and self._waiting:
-                self._write_group()
-            self._writer.close()
+            with suppress(OSError) if failed else self._explaining():
+                if not failed and self._waiting:
+                    self._write_group()
+                self._writer.close()
+                self._file.close()
+            if not failed:
+                self._part.replace(self._path)
         finally:
-            self._file.close()
-            if failed:
-                self._part.unlink(missing_ok=True)
-        if not failed:
-            self._part.replace(self._path)
+            with suppress(OSError):  # once more, where the first could not write what was left
+                self._file.close()
+            self._part.unlink(missing_ok=True)
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{self._path}: cannot be written: {reason}; is there room?") from None
 
     def _make_schema(self, labels: Sequence[str]) -> Any:
         pa = self._pa

@@ -275,6 +275,19 @@ def test_the_terminal_shows_samples_and_a_summary(run, home):
     assert not any("more than a reader" in line for line in lines)
 
 
+def test_steps_are_lines_if_asked_for_and_silent_otherwise(run, home, tmp_path):
+    again = ["--overwrite", *LEARN]
+    learn = ["learn", home / "train.mcap", "-o", tmp_path / "model", *again]
+    train = ["train", home / "train.mcap", "-m", home / "direct", "-o", tmp_path / "clf", "--overwrite"]
+    evaluate = ["evaluate", home / "train.mcap", "--method", "counts", "--early-samples", "0"]
+    for command, step in ((learn, "learning 1/"), (train, "encoding 40/40"), (evaluate, "cells 1/1")):
+        assert step in run(*command, "--verbose").err
+        assert run(*command, "-q").err == ""
+        assert run(*command, "-q", "-v").err == ""
+    assert "cells" not in run(*evaluate).err
+    assert "counts: " in run(*evaluate).err
+
+
 def test_a_split_and_a_speed(run, home):
     said = run("replay", home / "train.mcap", "-m", home / "direct", "--split", "test", "--json").json
     assert said["samples"] == 10

@@ -3,11 +3,13 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -67,7 +69,7 @@ def sample_folder(folder, n, bad=()):
 
 
 def test_commands_stand_in_the_order_in_which_they_are_needed():
-    names = re.findall(r"^[│ ] ([a-z]+)  ", run("--help").stdout, re.MULTILINE)
+    names = re.findall(r"^  ([a-z]+)  ", run("--help").stdout, re.MULTILINE)
     assert names[:3] == ["demo", "info", "convert"]
     assert names[-1] == "doctor"
     assert set(names) == {
@@ -96,13 +98,28 @@ def test_completion_is_shown_and_completes(shell, monkeypatch):
 
 
 @pytest.mark.parametrize("command", [None, *sorted(c.callback.__name__ for c in cli.app.registered_commands)])
-def test_help_fits_into_sixty_columns(command, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
-    monkeypatch.setenv("TERMINAL_WIDTH", "60")
+def test_help_fits_into_sixty_columns_and_says_whole_sentences(command):
     arguments = [command, "--help"] if command else ["--help"]
-    shown = run(*arguments)
+    shown = run(*arguments, terminal_width=60)
     assert shown.exit_code == 0
     assert max(map(len, shown.stdout.splitlines())) <= 60
+    assert not re.search(r"[a-z]\.\.\.", shown.stdout)
+
+
+def test_help_asks_the_terminal_how_wide_it_is(tmp_path):
+    status, written = in_a_terminal(tmp_path, "convert", "--help")
+    assert status == 0
+    assert 50 < max(map(len, written.split("\r\n"))) <= 60
+
+
+def test_help_waits_neither_for_numba_nor_for_the_markdown_of_rich():
+    code = "import sys; from streamfeat.cli import app; app(standalone_mode=False); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=True, timeout=60
+    )
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert "streamfeat.cli" in loaded
+    assert not loaded & {"numpy", "numba", "scipy", "zenoh", "asyncio", "rich.markdown", "pygments"}
 
 
 @pytest.mark.parametrize("no_color", ["", "1"])
@@ -127,6 +144,42 @@ def test_no_line_is_wider_than_a_terminal_of_sixty_columns(tmp_path):
     assert "/s" in plain
     assert max(map(len, re.split(r"[\r\n]+", plain))) <= 60
     assert "3/3" not in in_a_terminal(tmp_path, "convert", "in", "quiet.mcap", "--quiet")[1]
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    """What a replay of two samples needs."""
+    folder = tmp_path_factory.mktemp("replay")
+    model = tiny.encoder()
+    model.save(folder / "model")
+    tiny.classifier(model).save(folder / "classifier")
+    tiny.write_items(folder / "two.mcap", tiny.labelled_items(2))
+    return folder
+
+
+def test_lines_of_a_replay_stand_above_its_bar(replayed):
+    words = ["replay", "two.mcap", "-m", "model", "-c", "classifier", "--verbose", "--speed", "2"]
+    status, written = in_a_terminal(replayed, *words)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written)
+    assert status == 0
+    lines = re.split(r"[\r\n]+", plain)
+    assert max(map(len, lines)) <= 60
+    assert sum(" % of " in line for line in lines) == 2
+    assert not any(" % of " in line and "replaying" in line for line in lines)
+    assert any("replaying" in line and "6/6" in line for line in lines)  # packets and labels
+
+
+def test_what_goes_to_a_file_while_a_bar_is_shown_is_in_the_file(replayed):
+    process = [*COMMAND, "replay", "two.mcap", "-m", "model", "--json-lines", "-", "--emit", "1s"]
+    script = f"{shlex.join(process)} > lines"
+    leader, follower = pytest.importorskip("pty").openpty()
+    with os.fdopen(leader, "rb"), os.fdopen(follower, "wb"):
+        done = subprocess.run(
+            ["sh", "-c", script], stdin=follower, stderr=follower, cwd=replayed, check=False, timeout=120
+        )
+    assert done.returncode == 0
+    lines = (replayed / "lines").read_text().splitlines()
+    assert len([json.loads(line) for line in lines]) >= 2
 
 
 def test_output_that_is_no_terminal_has_neither_colour_nor_bars(tmp_path):
@@ -167,3 +220,13 @@ def test_one_file_that_cannot_be_read_leaves_no_recording(tmp_path):
     assert isinstance(done.exception, cli.InputError)
     assert "none of the 2 samples can be read" in str(done.exception)
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_predicting_does_not_wait_for_scikit_learn():
+    code = "import sys, streamfeat.replay, streamfeat.live.listen; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    loaded = set(done.stdout.split())
+    assert "streamfeat.classifier" in loaded
+    assert not loaded & {"sklearn", "pandas", "bokeh", "pyarrow", "foxglove"}

@@ -412,7 +412,9 @@ def test_one_split_without_look_ahead(run, home):
         "--seconds",
         "1",
     ]
-    status, out, _ = run(home / "digits.mcap", "-m", home / "direct.safetensors", *arguments, "--json")
+    words = [home / "digits.mcap", "-m", home / "direct.safetensors", *arguments, "--json", "--verbose"]
+    status, out, err = run(*words)
+    assert "compiling 1/1" in err  # steps are lines, and not among the JSON
     said = json.loads(out)
     with open_recording(home / "digits.mcap") as recording:
         events = sum(len(sample.events) for sample in recording.samples() if sample.label.split == "test")

@@ -47,11 +47,12 @@ def files(tmp_path_factory):
 
 
 def test_listen_ends_well_when_interrupted(files, tmp_path):
-    port, out = free_port(), tmp_path / "out.mcap"
+    pytest.importorskip("pyarrow", reason="the extra `export` is not installed")
+    port, out, table = free_port(), tmp_path / "out.mcap", tmp_path / "out.parquet"
     words = ["cam/*/events", "-m", files / "model", "-c", files / "classifier", "--emit", "10ms"]
     with (
         plain_session(port, listen=True) as net,
-        started("listen", *words, "-o", out, "--port", port, "--json") as process,
+        started("listen", *words, "-o", out, "--table", table, "--port", port, "--json") as process,
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(batches(20)):
@@ -73,6 +74,12 @@ def test_listen_ends_well_when_interrupted(files, tmp_path):
     with out.open("rb") as file:
         counts = make_reader(file).get_summary().statistics.message_count
     assert counts == 2 * result["emissions"]
+    from pyarrow.parquet import read_table
+
+    rows = read_table(table)
+    assert rows.num_rows == result["emissions"]
+    assert set(rows["topic"].to_pylist()) == {"cam/a/events"}
+    assert {len(scores) for scores in rows["scores"].to_pylist()} == {3}
 
 
 def test_record_survives_a_kill_with_all_but_the_last_chunk(files, tmp_path):

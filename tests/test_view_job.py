@@ -22,7 +22,8 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 from streamfeat.cli import app
 from streamfeat.codecs import encode
 from streamfeat.errors import InputError
-from streamfeat.live.names import PlainNames
+from streamfeat.live.names import PlainNames, RosNames
+from streamfeat.live.publish import Publish
 from streamfeat.messages import EventPacket
 from streamfeat.view.job import View, prefix_of
 
@@ -184,6 +185,29 @@ def test_live_topics_are_shown_and_not_answered(files):
     assert {topic for topic, *_ in got} == {"/robot/cam/view/status", "/robot/cam/view/events"}
     assert answers == []
     assert view.result()["frames"] >= 1
+
+
+def test_a_ros_camera_is_shown(files):
+    names, port, lines = RosNames("/event_camera/events"), free_port(), []
+    view = View(
+        names, files / "model", files / "classifier", emit="10ms", rate=1000, say=lines.append, port=port
+    )
+    camera = Publish(
+        [(files / "samples.mcap", "/event_camera/events")], names, speed=4.0, port=port, wait_s=30
+    )
+    with shown(view, publish=False):
+        until(lambda: lines)
+        with Client(int(lines[0].rpartition(":")[2])) as client:
+            camera.run()
+            sent = camera.result()
+            until(lambda: view.result()["events"] == sent["events"])
+            client.subscribe("/status", "/events", "/prediction")
+            got = []
+            client.until(lambda: len({topic for topic, *_ in got}) == 3, got)
+    assert sent["events"] == 6 * 300
+    prefix = "/event_camera/view"
+    assert {topic for topic, *_ in got} == {f"{prefix}/{name}" for name in ("status", "events", "prediction")}
+    assert view.result()["lost"] == 0
 
 
 @pytest.mark.parametrize(

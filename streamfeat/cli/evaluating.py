@@ -19,7 +19,9 @@ from streamfeat.cli import options
 from streamfeat.cli.program import (
     JsonOption,
     OverwriteOption,
+    QuietOption,
     RecordingsArgument,
+    StepsOption,
     TopicOption,
     app,
     err,
@@ -88,6 +90,8 @@ def evaluate(
     page: Annotated[Path | None, typer.Option("--report", help="Page to write, .html; extra `plot`.")] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Accuracy of learned features and of baselines on labelled recordings, over settings and time.
@@ -112,7 +116,7 @@ def evaluate(
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
-        with progress_bars() as report:
+        with progress_bars(quiet=quiet, as_lines=verbose) as report:
             report("reading labels", 0, 0, "")
             data = DataSet(recordings, topic, folds, Trial(**base).seed, on)
             report("reading labels", 1, 1, "")
@@ -122,7 +126,7 @@ def evaluate(
                 early_samples=early_samples,
                 state=state_path(output) if output else None,
                 report=report,
-                finished=lambda row: err.print(_in_short(row), soft_wrap=True),
+                finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
         how = (

@@ -16,7 +16,9 @@ from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
     OverwriteOption,
+    QuietOption,
     RecordingsArgument,
+    StepsOption,
     TopicOption,
     app,
     err,
@@ -59,6 +61,8 @@ def learn(
     ] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Learn features without labels; samples of validation and test splits are not looked at.
@@ -74,7 +78,7 @@ def learn(
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     try:
-        with contextlib.ExitStack() as files, progress_bars() as report:
+        with contextlib.ExitStack() as files, progress_bars(quiet=quiet, as_lines=verbose) as report:
             opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
             encoder = learn_encoder(opened, setting, resume=before, report=report)
     except KeyboardInterrupt:
@@ -123,6 +127,8 @@ def train(
     mirror: options.Mirror = False,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
@@ -133,7 +139,7 @@ def train(
 
     refuse_existing(classifier, overwrite=overwrite)
     encoder = Encoder.load(model)
-    with contextlib.ExitStack() as files, progress_bars() as report:
+    with contextlib.ExitStack() as files, progress_bars(quiet=quiet, as_lines=verbose) as report:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
         for rec in opened:
             if not rec.labels:

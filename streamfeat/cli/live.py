@@ -14,11 +14,14 @@ from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
     OverwriteOption,
+    QuietOption,
+    VerboseOption,
     app,
     err,
     out,
     print_losses,
     print_result,
+    progress_bars,
     refuse_existing,
 )
 from streamfeat.errors import InputError
@@ -74,6 +77,10 @@ def listen(
         typer.Option(help="Write a JSON line for each emission to this file; - is stdout."),
     ] = None,
     features: Annotated[bool, typer.Option("--features", help="Include features in JSON lines.")] = False,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="Write features and predictions to this .parquet or .arrow file; extra `export`."),
+    ] = None,
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from labels published beside the events.")
     ] = False,
@@ -89,13 +96,14 @@ def listen(
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     overwrite: OverwriteOption = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")] = False,
+    quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
     from streamfeat.live.listen import Listen
 
-    for path in (output, json_lines):
+    for path in (output, json_lines, table):
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
     names = names_of(key, ros2, domain)
@@ -115,9 +123,11 @@ def listen(
     to_terminal = str(json_lines) == "-"
     job.run(
         console=None if quiet or as_json or to_terminal else out,
+        every_sample=verbose,
         recording_out=output,
         json_lines=sys.stdout if to_terminal else json_lines,
         with_features=features,
+        table=table,
     )
     if not to_terminal:
         print_result(job.result(), "heard", as_json=as_json)
@@ -138,6 +148,7 @@ def publish(
     reliable: ReliableOption = False,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Recordings as live cameras, at their own pace or faster; several at once."""
@@ -161,7 +172,8 @@ def publish(
         zenoh_config=zenoh_config,
         port=port,
     )
-    job.run()
+    with progress_bars(quiet=quiet) as report:
+        job.run(report)
     print_result(job.result(), "published", as_json=as_json)
 
 
@@ -177,6 +189,7 @@ def record(
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
@@ -194,7 +207,8 @@ def record(
         port=port,
         console=err,
     )
-    job.run()
+    with progress_bars(quiet=quiet) as report:
+        job.run(report)
     print_result(job.result(), "recorded", as_json=as_json)
 
 
@@ -203,12 +217,14 @@ def recover(
     source: Annotated[Path, typer.Argument(metavar="IN", help="Damaged or unfinished recording.")],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Whatever can be read of a damaged recording, in a new and intact one."""
     from streamfeat.recorder import recover as recover_recording
 
-    losses = recover_recording(source, target, overwrite=overwrite)
+    with progress_bars(quiet=quiet) as report:
+        losses = recover_recording(source, target, overwrite=overwrite, report=report)
     result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
     print_result(result, "recovered", as_json=as_json)
     print_losses(losses)

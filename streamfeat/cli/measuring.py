@@ -19,7 +19,9 @@ from rich.table import Table
 from streamfeat.cli.program import (
     JsonOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
+    StepsOption,
     TopicOption,
     app,
     err,
@@ -65,6 +67,8 @@ def latency(
     ] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Per-event update latency and that of a whole hop: percentiles for each model and policy."""
@@ -87,7 +91,7 @@ def latency(
         look_ahead=look_ahead,
     )
     try:
-        with progress_bars(from_a_thread=False) as progress:
+        with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")
             report.compile()
             progress("compiling", 1, 1, "")

@@ -40,6 +40,7 @@ __all__ = [
     "QuietOption",
     "RecordingArgument",
     "RecordingsArgument",
+    "StepsOption",
     "TopicOption",
     "VerboseOption",
     "app",
@@ -56,12 +57,17 @@ _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
 class _InOrder(TyperGroup):
-    """Commands in the order in which somebody new needs them, not in that of imports."""
+    """Commands in the order in which somebody new needs them, each with its whole first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
         known = [*_ORDER, *(name for name in names if name not in _ORDER + _LAST), *_LAST]
         return [name for name in known if name in names]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        rows = [(name, self.commands[name].get_short_help_str(200)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 app = typer.Typer(
@@ -69,7 +75,7 @@ app = typer.Typer(
     cls=_InOrder,
     help="Learned features from event cameras: event by event, exact, and never behind.",
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,  # plain pages: for others Typer imports a parser of Markdown, a third of a start
     pretty_exceptions_enable=False,
 )
 
@@ -85,6 +91,9 @@ ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `s
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]
+StepsOption = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Show steps as lines, also where there is no terminal.")
+]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
 
@@ -100,11 +109,15 @@ class _RateColumn(ProgressColumn):
         return Text(f"{speed:,.{0 if speed >= 10 else 1}f}/s" if speed else "", style="dim")
 
 
+Report = Callable[[str, int, int, str], None]
+"""Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
+
+
 @contextlib.contextmanager
 def progress_bars(
-    *, from_a_thread: bool = True, quiet: bool = False
-) -> Iterator[Callable[[str, int, int, str], None]]:
-    """A function (step, done, of how many, remark) that keeps a bar for each step on standard error.
+    *, from_a_thread: bool = True, quiet: bool = False, as_lines: bool = False, below: Console = err
+) -> Iterator[Report]:
+    """A function that keeps a bar for each step on standard error.
 
     A bar says how many are done, how many a second, and how long the rest will take. Nothing is shown where
     standard error is no terminal.
@@ -113,7 +126,16 @@ def progress_bars(
         from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
             called, once a second at most, so that nothing else runs while somebody measures.
         quiet: show nothing.
+        as_lines: in place of bars a line for each step's begin and end, and one a second between them,
+            terminal or not.
+        below: what lines are printed to meanwhile; if that is a terminal, the bars stay below them.
     """
+    if quiet or not (as_lines or err.is_terminal):
+        yield lambda step, done, total, remark: None
+        return
+    if as_lines:
+        yield _lines()
+        return
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -123,8 +145,12 @@ def progress_bars(
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         TextColumn("[dim]{task.fields[remark]}"),
     )
-    hidden = quiet or not err.is_terminal
-    with Progress(*columns, console=err, disable=hidden, auto_refresh=from_a_thread) as progress:
+    with Progress(
+        *columns,
+        console=below if below.is_terminal else err,
+        auto_refresh=from_a_thread,
+        redirect_stdout=False,  # what goes to a file while bars are shown is not for the terminal
+    ) as progress:
         tasks: dict[str, Any] = {}
         drawn = 0.0
 
@@ -138,6 +164,20 @@ def progress_bars(
                 drawn = time.monotonic()
 
         yield report
+
+
+def _lines() -> Report:
+    """What prints steps as lines."""
+    printed: dict[str, float] = {}
+
+    def report(step: str, done: int, total: int, remark: str) -> None:
+        now = time.monotonic()
+        if step not in printed or done == total > 0 or now > printed[step] + 1:
+            printed[step] = now
+            count = f" {done:,}/{total:,}" if total else f" {done:,}" if done else ""
+            err.print(f"{escape(step)}{count}  [dim]{escape(remark)}[/]", soft_wrap=True)
+
+    return report
 
 
 def print_losses(losses: "Losses") -> None:

@@ -35,6 +35,9 @@ def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonO
     from streamfeat.recording import open_recording
 
     with open_recording(recording, topic) as rec:
+        with progress_bars() as report:
+            report("reading", 0, 0, "")
+            n_events = rec.n_events  # reads the whole file
         height, width = rec.resolution
         labels = sorted({label.label for label in rec.labels})
         splits = sorted({label.split for label in rec.labels if label.split})
@@ -46,12 +49,12 @@ def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonO
             "read": rec.topic,
             "encoding": rec.encoding,
             "resolution": f"{width}x{height}",
-            "events": rec.n_events,
+            "events": n_events,
             "on": rec.n_on,
             "off": rec.n_off,
             "first_us": rec.first_us,
             "duration_s": rec.duration_us / 1e6,
-            "events_per_s": round(rec.n_events / max(rec.duration_us / 1e6, 1e-6)),
+            "events_per_s": round(n_events / max(rec.duration_us / 1e6, 1e-6)),
             "samples": len(rec.labels),
             "labels": ", ".join(labels),
             "splits": ", ".join(splits),

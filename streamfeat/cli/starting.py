@@ -36,7 +36,7 @@ def demo(
 ) -> None:
     """Simulate recordings of digits, learn features, train, and replay with a live picture.
 
-    Takes a minute when kernels have to be compiled first; nothing is downloaded.
+    Takes up to a minute when kernels have to be compiled first; nothing is downloaded.
     """
     from streamfeat.demo import FILES, Demo
 
@@ -56,6 +56,7 @@ def demo(
             job = Demo(folder, report)
             simulated = job.simulate()
             encoder = job.learn()
+            job.compile(encoder)
             classifier = job.fit(encoder)
         replayed = job.replay(encoder, classifier, None if quiet or as_json else out)
     except KeyboardInterrupt:

@@ -22,6 +22,7 @@ from streamfeat.cli.program import (
     out,
     print_losses,
     print_result,
+    progress_bars,
     refuse_existing,
 )
 
@@ -79,14 +80,16 @@ def replay(
         learn_online=learn_online,
     )
     to_terminal = str(json_lines) == "-"
-    job.run(
-        console=None if quiet or as_json or to_terminal else out,
-        every_sample=verbose,
-        recording_out=output,
-        json_lines=sys.stdout if to_terminal else json_lines,
-        with_features=features,
-        table=table,
-    )
+    with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
+        job.run(
+            console=None if quiet or as_json or to_terminal else out,
+            every_sample=verbose,
+            recording_out=output,
+            json_lines=sys.stdout if to_terminal else json_lines,
+            with_features=features,
+            table=table,
+            report=report,
+        )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)
     print_losses(job.losses)

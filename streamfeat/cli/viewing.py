@@ -15,10 +15,12 @@ from streamfeat.cli.program import (
     JsonOption,
     ModelOption,
     OverwriteOption,
+    QuietOption,
     TopicOption,
     app,
     err,
     print_result,
+    progress_bars,
     refuse_existing,
 )
 from streamfeat.errors import InputError
@@ -65,6 +67,7 @@ def view(
     zenoh_config: ConfigOption = None,
     zenoh_port: Annotated[int, typer.Option(help="Loopback port where sessions meet.")] = 7447,
     overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Events, bins, volumes, features, scores, latency and drops as they happen; a recording or live topics.
@@ -103,12 +106,13 @@ def view(
         live_port=port if served else None,
         web_port=web_port if web else None,
         recording_out=output,
-        say=lambda line: err.print(escape(line), soft_wrap=True),
+        say=lambda line: None if quiet else err.print(escape(line), soft_wrap=True),
         **options,
     )
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
-    job.run(**({"loop": loop} if recording else {"publish": False}))
+    with progress_bars(quiet=quiet) as report:
+        job.run(**({"loop": loop, "report": report} if recording else {"publish": False}))
     print_result(job.result(), "viewed", as_json=as_json)
 
 

@@ -80,7 +80,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
 def _plot(x: str, y: str, *, height: int = 340, **options: Any) -> "figure":
     from bokeh.plotting import figure
 
-    plot = figure(width=1060, height=height, x_axis_label=x, y_axis_label=y, tools=_TOOLS, **options)
+    plot = figure(height=height, x_axis_label=x, y_axis_label=y, tools=_TOOLS, **options)
     for axis in plot.axis:
         axis.axis_label_text_font_size = "13px"
         axis.major_label_text_font_size = "12px"
@@ -130,6 +130,8 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
 
 
 def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
+    from bokeh.models import NumeralTickFormatter
+
     header, lines = early_table(result)
     by_time = _plot("time since the sample began, ms", "accuracy")
     by_events = _plot("events since the sample began", "accuracy", x_axis_type="log")
@@ -137,6 +139,8 @@ def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
         for plot, axis, unit in ((by_time, "time", "ms"), (by_events, "events", "events")):
             points = row["early"][axis]
             _line(plot, [p[unit] for p in points], [p["accuracy"] for p in points], row["method"], i)
+    by_events.xaxis.formatter = NumeralTickFormatter(format="0,0")
+    by_events.xaxis.ticker = sorted({p["events"] for row in rows for p in row["early"]["events"]})
     return [Table(header, lines, [False, True, True, True]), _with_legend(by_time), _with_legend(by_events)]
 
 
@@ -191,18 +195,24 @@ def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
     return plot
 
 
+def _by_iteration(label: str) -> "figure":
+    plot = _plot("iteration", label, height=280)
+    plot.xaxis[0].ticker.min_interval = 1  # there is no iteration 1.2
+    return plot
+
+
 def _convergence(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]:
     yield "The objective after each half-step: codes, then filters. It may not rise."
     for i, row in enumerate(rows):
         objective = row["learned"]["objective"]
-        plot = _plot("iteration", "objective, mean over volumes", height=280)
+        plot = _by_iteration("objective, mean over volumes")
         _line(plot, (np.arange(len(objective)) / 2 + 0.5).tolist(), objective, row["method"], i)
         yield _with_legend(plot)
     for name, label in (
         ("condition", "condition number (ratio of singular values)"),
         ("coherence", "coherence (largest |cos| between filters)"),
     ):
-        plot = _plot("iteration", label, height=280)
+        plot = _by_iteration(label)
         for i, row in enumerate(rows):
             values = [np.nan if value is None else value for value in row["learned"][name]]
             _line(plot, list(range(1, len(values) + 1)), values, row["method"], i)

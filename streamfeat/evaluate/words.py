@@ -132,15 +132,18 @@ def online_table(result: dict[str, Any]) -> Lines:
 
 
 def early_table(result: dict[str, Any]) -> Lines:
-    """When each method has most of its final accuracy."""
+    """When each method has most of its final accuracy; never, where that is nothing."""
     rows = [row for row in base_rows(result) if "early" in row]
     share = f"{100 * rows[0]['share_reached']['share']:.0f} %" if rows else ""
     return ("method", "final accuracy", f"{share} of it after, ms", f"{share} of it after, events"), [
         [
             row["method"],
             f"{row['early']['time'][-1]['accuracy']:.3f}",
-            f"{row['share_reached']['ms']:g}",
-            f"{row['share_reached']['events']:,}",
+            *(
+                (f"{row['share_reached']['ms']:g}", f"{row['share_reached']['events']:,}")
+                if row["early"]["time"][-1]["accuracy"]
+                else ("-", "-")
+            ),
         ]
         for row in rows
     ]

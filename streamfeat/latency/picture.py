@@ -4,6 +4,7 @@ Lives here: percentile curves, latency over stream time.
 Not here: measuring (`measure`), numbers as text (`words`), the skeleton of a page (`streamfeat.report`).
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.files import replacing
+from streamfeat.files import write_atomically
 from streamfeat.latency.measure import LatencyReport, Row
 from streamfeat.latency.update import Walk
 from streamfeat.latency.words import COLUMNS, cells, describe, notes
@@ -138,7 +139,6 @@ def _curves_of_page(report: LatencyReport) -> "figure":
     from bokeh.plotting import figure
 
     plot = figure(
-        width=1060,
         height=520,
         x_axis_type="log",
         y_axis_type="log",
@@ -165,7 +165,6 @@ def _cloud_of_page(walk: Walk) -> "figure":
     from bokeh.plotting import figure
 
     plot = figure(
-        width=1060,
         height=340,
         y_axis_type="log",
         x_axis_label=_TIME_AXIS,
@@ -243,5 +242,6 @@ def _draw_image(path: Path, report: LatencyReport) -> None:
         below.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)
     for axis in axes:
         axis.grid(alpha=0.3)
-    with replacing(path) as temporary:
-        image.savefig(temporary, format="png")
+    picture = io.BytesIO()
+    image.savefig(picture, format="png")
+    write_atomically(path, picture.getvalue())

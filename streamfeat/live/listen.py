@@ -34,6 +34,7 @@ from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
 from streamfeat.session import Session, StreamItem
 from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
+from streamfeat.table import TableSink
 
 __all__ = ["Listen"]
 
@@ -111,9 +112,11 @@ class Listen:
         self,
         *,
         console: Console | None = None,
+        every_sample: bool = False,
         recording_out: Path | None = None,
         json_lines: Path | TextIO | None = None,
         with_features: bool = False,
+        table: Path | None = None,
         more: Sink[Emission] | None = None,
         publish: bool = True,
     ) -> None:
@@ -121,9 +124,11 @@ class Listen:
 
         Args:
             console: for a table that is kept up to date if it is a terminal, or else for lines.
+            every_sample: a line for each labelled sample, however fast they come; no table then.
             recording_out: MCAP file for features and predictions; replaced if it exists.
             json_lines: file (replaced) or open stream for a JSON line for each emission.
             with_features: include features in JSON lines.
+            table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
             more: one sink more.
             publish: put features and predictions on the network, beside the events.
 
@@ -131,7 +136,8 @@ class Listen:
             InputError: an output, the network or the metrics address cannot be used.
         """
         self._warm_up()
-        is_screen = console is not None and console.is_terminal
+        is_screen = console is not None and console.is_terminal and not every_sample
+        labels = self._classifier.labels if self._classifier else ()
         screen = Live(
             get_renderable=lambda: HealthTable(self.health),
             console=console,
@@ -144,9 +150,12 @@ class Listen:
         ):
             sinks = open_sinks(
                 partial(OutputSink, session, self._names, self.health.on_published) if publish else None,
-                partial(TerminalSink, console) if console and not is_screen else None,
+                partial(TerminalSink, console, every_sample=every_sample)
+                if console and not is_screen
+                else None,
                 partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
                 partial(_recording_sink, recording_out) if recording_out else None,
+                partial(TableSink, table, self._encoder.n_features, labels) if table else None,
                 (lambda: more) if more else None,
             )
             pipeline: Pipeline[StreamItem | Gone, Emission] = Pipeline(self._intake, self.health, sinks)

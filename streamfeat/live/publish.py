@@ -5,7 +5,7 @@ Not here: reading (`recording`), pacing (`pipeline`), the network (`network`, `p
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -75,8 +75,15 @@ class Publish:
         self._seconds = 0.0
         self.interrupted = False
 
-    def run(self) -> None:
-        """Publish to the end, or to the first SIGINT or SIGTERM."""
+    def run(
+        self, report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None
+    ) -> None:
+        """Publish to the end, or to the first SIGINT or SIGTERM.
+
+        Args:
+            report: called with (step, done, of how many, remark) as packets and labels are read, from a
+                thread.
+        """
         # Only those without a pace of their own can wait for readers; a camera cannot.
         options = {"block": self._speed is None, "reliable": self._reliable}
         with open_session(self._zenoh_config, port=self._port) as session, ExitStack() as recordings:
@@ -87,7 +94,10 @@ class Publish:
             pipelines: list[Pipeline[Packet | Label, EventPacket | LabelMessage]] = []
             for (path, topic), cutter, sink in zip(self._sources, self._cutters, self._sinks, strict=True):
                 _wait_for_readers(session, self._names.key(topic, EventPacket.SCHEMA_NAME), self._wait_s)
-                items = recordings.enter_context(open_recording(path)).played(loop=self._loop)
+                items = recordings.enter_context(open_recording(path)).played(
+                    loop=self._loop,
+                    report=lambda n, total, topic=topic: report(f"publishing {topic}", n, total, ""),  # type: ignore[misc]
+                )
                 pipelines.append(Pipeline(items, cutter, [sink], speed=self._speed))
             started = time.perf_counter()
             self.interrupted = run_until_interrupted(pipelines)

@@ -9,7 +9,7 @@ the operating system, so a process that is killed at any byte loses what came af
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -83,8 +83,13 @@ class Record:
         self._seconds = 0.0
         self.interrupted = False
 
-    def run(self) -> None:
+    def run(
+        self, report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None
+    ) -> None:
         """Record until `stop`, SIGINT or SIGTERM; what has arrived by then is written.
+
+        Args:
+            report: called with (step, messages, 0, remark) from a thread, whenever there was something.
 
         Raises:
             InputError: the file cannot be written, or the network not be used.
@@ -101,7 +106,7 @@ class Record:
                 )
             )
             pipeline: Pipeline[RawMessage | _Flush, RawMessage | _Flush] = Pipeline(
-                self._items(), _Unchanged(), [sink]
+                self._items(report), _Unchanged(), [sink]
             )
             started = time.monotonic()
             with Subscription(session, self._names, self._inbox, reliable=self._reliable):
@@ -130,7 +135,7 @@ class Record:
             "interrupted": self.interrupted,
         }
 
-    def _items(self) -> Iterator[RawMessage | _Flush | None]:
+    def _items(self, report: Callable[[str, int, int, str], None]) -> Iterator[RawMessage | _Flush | None]:
         due = time.monotonic() + self._chunk_s
         while (taken := self._inbox.take(min(_POLL_S, self._chunk_s))) is not None:
             for message in taken:
@@ -145,6 +150,7 @@ class Record:
                 due = time.monotonic() + self._chunk_s
                 yield _Flush()
             if not self._inbox.depth:
+                report("recording", self._written.total(), 0, f"{self._bytes:,} bytes")
                 yield None
 
     def _is_wanted(self, message: RawMessage) -> bool:

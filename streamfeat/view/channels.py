@@ -197,14 +197,16 @@ class FileBoard(Board):
     Args:
         about: see `Board`.
         path: written in place; whoever calls puts it where it belongs when it is complete.
+        name: where that is, for whoever reads an error.
 
     Raises:
         InputError: it cannot be written.
     """
 
-    def __init__(self, about: Mapping[str, str], path: Path) -> None:
+    def __init__(self, about: Mapping[str, str], path: Path, name: Path | None = None) -> None:
         """Open the file."""
         super().__init__(about)
+        self._name = name or path
         options = MCAPWriteOptions(compression=MCAPCompression.Lz4)
         try:
             self._file = foxglove.open_mcap(
@@ -214,5 +216,12 @@ class FileBoard(Board):
             raise InputError(f"{path}: cannot write there: {error}") from None
 
     def close(self) -> None:
-        """Finish the file."""
-        self._file.close()
+        """Finish the file.
+
+        Raises:
+            InputError: this, or anything before it, could not be written; only now the library says so.
+        """
+        try:
+            self._file.close()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"{self._name}: cannot be written: {error}; is there room?") from None

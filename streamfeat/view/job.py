@@ -17,13 +17,10 @@ from streamfeat.emission import EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.errors import InputError
-from streamfeat.events import make_events
 from streamfeat.files import replacing, write_atomically
 from streamfeat.live.listen import Listen
 from streamfeat.live.names import Names, beside
-from streamfeat.packets import Packet
-from streamfeat.replay import Replay
-from streamfeat.session import Session
+from streamfeat.replay import Replay, warm_up
 from streamfeat.view.channels import Board, FileBoard, LiveBoard
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
@@ -116,7 +113,7 @@ class View:
                 with self._heeding_signals():
                     self._open(serving, writing)
                     if self._is_recording:
-                        _warm_up(self._encoder, self._policy)
+                        warm_up(self._encoder, self._policy)
                     if waits:
                         self._wait_for(self._looked, "waiting for somebody to look; Ctrl-C ends")
                 if not self._stopped.is_set():
@@ -155,7 +152,7 @@ class View:
         known = about(self._encoder, self._labels)
         if self._recording_out:
             path = writing.enter_context(replacing(self._recording_out))
-            file = FileBoard(known, path)
+            file = FileBoard(known, path, self._recording_out)
             writing.callback(file.close)
             self._boards.append(file)
         if self._live_port is None:
@@ -191,13 +188,3 @@ class View:
 
     def _engine_of(self, topic: str) -> Callable[..., Engine]:
         return partial(ObservedEngine, watch=self._sink.watch(topic))
-
-
-def _warm_up(encoder: Encoder, policy: EmitPolicy) -> None:
-    """Compile what the first packets would otherwise have to wait for."""
-    session = Session(encoder, policy)
-    side = encoder.geometry.patch * encoder.geometry.downsample
-    for _ in session.process(Packet("", make_events([0], [0], [1], [0]), (side, side), 0, 0)):
-        pass
-    for _ in session.finish():
-        pass
