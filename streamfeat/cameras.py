@@ -10,8 +10,9 @@ from dataclasses import dataclass, fields
 
 from streamfeat.emission import Emission
 from streamfeat.errors import InputError
+from streamfeat.moment import SessionSnapshot, SessionStats
 from streamfeat.packets import Label, Packet
-from streamfeat.session import Session, SessionStats, StreamItem
+from streamfeat.session import Session, StreamItem
 
 __all__ = ["MAX_CAMERAS", "Cameras", "Gone"]
 
@@ -66,6 +67,21 @@ class Cameras:
     def stats_by_topic(self) -> dict[str, SessionStats]:
         """What the session of each topic that is served has done."""
         return {topic: session.stats() for topic, session in list(self._sessions.items())}
+
+    def snapshots(self) -> dict[str, SessionSnapshot]:
+        """What each session needs to go on."""
+        return {topic: session.snapshot() for topic, session in self._sessions.items()}
+
+    def restore(self, topic: str, snapshot: SessionSnapshot) -> None:
+        """Serve a camera as it was served when its snapshot was taken.
+
+        Raises:
+            InputError: no session can go on from there.
+        """
+        session = self._make_session(topic)
+        session.restore(snapshot)
+        self._sessions[topic] = session
+        self.seen += 1
 
     def process(self, item: StreamItem | Gone) -> Iterator[Emission]:
         """Hand an item to the session of its topic, and yield what is read on the way."""

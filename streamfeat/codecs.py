@@ -51,8 +51,53 @@ class Decoder(Protocol):
     def resync(self) -> None:
         """Forget what packets before a gap said about the ones after it."""
 
+    def snapshot(self) -> list[int]:
+        """The state that is carried on; empty where packets stand alone."""
 
-class MonoDecoder:
+    def restore(self, state: list[int]) -> None:
+        """Go on from a snapshot.
+
+        Args:
+            state: numbers from 0 to 2^62.
+
+        Raises:
+            InputError: there are more or fewer than this decoder has.
+        """
+
+
+class _Alone:
+    """What the decoders share whose packets stand alone."""
+
+    def resync(self) -> None:
+        """See `Decoder.resync`."""
+
+    def snapshot(self) -> list[int]:
+        """See `Decoder.snapshot`."""
+        return []
+
+    def restore(self, state: list[int]) -> None:
+        """See `Decoder.restore`."""
+        if state:
+            raise InputError("the snapshot of a decoder holds more than it has")
+
+
+class _Carrying:
+    """What the decoders share that carry on a state."""
+
+    _state: NDArray[np.int64]
+
+    def snapshot(self) -> list[int]:
+        """See `Decoder.snapshot`."""
+        return [int(value) for value in self._state]
+
+    def restore(self, state: list[int]) -> None:
+        """See `Decoder.restore`."""
+        if len(state) != len(self._state):
+            raise InputError(f"the snapshot of a decoder holds {len(state)} numbers, not {len(self._state)}")
+        self._state[:] = state
+
+
+class MonoDecoder(_Alone):
     """`mono`: u64 words of `dt` ns (32 bits), x (16), y (15) and polarity (1)."""
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -67,11 +112,8 @@ class MonoDecoder:
         t = time_base_ns // 1000 + (time_base_ns % 1000 + dt_ns) // 1000
         return make_events(words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63, t)
 
-    def resync(self) -> None:
-        """See `Decoder.resync`: packets stand alone."""
 
-
-class LibcaerDecoder:
+class LibcaerDecoder(_Alone):
     """`libcaer`: u32 address and polarity, then u32 microseconds that wrap at 31 bits within a packet."""
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -88,11 +130,8 @@ class LibcaerDecoder:
         t = time_base_ns // 1000 + us + wraps * _LIBCAER_WRAP_US
         return make_events(data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1, t)
 
-    def resync(self) -> None:
-        """See `Decoder.resync`: packets stand alone."""
 
-
-class LibcaerCmpDecoder:
+class LibcaerCmpDecoder(_Carrying):
     """`libcaer_cmp`: u16 words, addresses carried over from the packet before."""
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -114,7 +153,7 @@ class LibcaerCmpDecoder:
         """See `Decoder.resync`: a packet begins with its own x."""
 
 
-class Evt3Decoder:
+class Evt3Decoder(_Carrying):
     """`evt3`, also the words of a Prophesee EVT 3.0 camera file: u16 words, all state carried over.
 
     Stream time is that of the camera, from its 24-bit microseconds with their wraps counted; `time_base` is

@@ -10,6 +10,7 @@ time, never on how often it was read or how the stream was cut into batches.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,9 +80,10 @@ class Snapshot:
 
     Attributes:
         fingerprint: of the encoder.
-        counts: `(T, H, W)` int32, the ring.
+        counts: `(T, H, W)` int32, the ring; bin `b` lives in slot `b % T`.
         atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        clock: `(7,)` int64, of which the current bin and the origin matter.
+        bin: the current one; `BEFORE_TIME` in an engine that has seen nothing.
+        origin_us: stream time at which bin 0 starts.
         tally: `(5,)` int64, what was counted.
         encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
     """
@@ -89,7 +91,8 @@ class Snapshot:
     fingerprint: str
     counts: NDArray[np.int32]
     atoms: NDArray[np.float64]
-    clock: NDArray[np.int64]
+    bin: int
+    origin_us: int
     tally: NDArray[np.int64]
     encoded: NDArray[np.int64]
 
@@ -318,14 +321,27 @@ class Engine:
         state.clock[CLOCK_ORIGIN] = origin
 
     def snapshot(self) -> Snapshot:
-        """Copy the state. Projections and codes are not part of it: they follow from the counts."""
-        self._update()
+        """Copy the state. Projections and codes are not part of it: they follow from the counts.
+
+        With the inverse formulation a code follows from the one before it, too, within its gap. So that an
+        engine which goes on and one which is restored have the same bits, this one starts again from the
+        codes that it gives away: a bin boundary costs as much.
+        """
         state = self._state
+        atoms = state.atoms[state.clock[CLOCK_PLANE], :, CODE].copy()
+        if self._operator.inverse:
+            self._update()
+            atoms[:] = state.atoms[state.clock[CLOCK_PLANE], :, CODE]
+            state.atoms[np.arange(len(state.atoms)) != state.clock[CLOCK_PLANE]] = 0
+            state.cursors[:] = 0
+            state.pooled[:] = 0
+            self._update()
         return Snapshot(
             fingerprint=self.encoder.fingerprint,
             counts=state.counts.copy(),
-            atoms=state.atoms[state.clock[CLOCK_PLANE], :, CODE].copy(),
-            clock=state.clock.copy(),
+            atoms=atoms,
+            bin=int(state.clock[CLOCK_NOW]),
+            origin_us=int(state.clock[CLOCK_ORIGIN]),
             tally=state.tally.copy(),
             encoded=state.encoded.copy(),
         )
@@ -333,29 +349,49 @@ class Engine:
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of an engine with the same encoder and resolution.
 
+        Arrays and numbers may come from anywhere: nothing that was not checked gets to a kernel.
+
         Raises:
-            InputError: the snapshot is of another encoder or another resolution.
+            InputError: the snapshot is of another encoder or another resolution, or of no engine at all;
+                nothing has changed.
         """
+        self._check(snapshot)
         state, limit = self._state, self._operator.max_count
-        if snapshot.fingerprint != self.encoder.fingerprint:
-            raise InputError(
-                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
-                f"{self.encoder.fingerprint[:12]}"
-            )
         codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
-        if snapshot.counts.shape != state.counts.shape or snapshot.atoms.shape != codes.shape:
-            raise InputError(
-                f"the snapshot holds a ring of {snapshot.counts.shape} and codes of {snapshot.atoms.shape}, "
-                f"this engine has {state.counts.shape} and {codes.shape}"
-            )
-        self.restart(int(snapshot.clock[CLOCK_ORIGIN]))
+        self.restart(snapshot.origin_us)
         state.counts[:] = snapshot.counts
         state.applied[:] = snapshot.counts.clip(-limit, limit)
         codes[:] = snapshot.atoms
-        moment = [CLOCK_NOW, CLOCK_START, CLOCK_SLOT]
-        state.clock[moment] = snapshot.clock[moment]
+        if snapshot.bin > BEFORE_TIME:
+            state.clock[CLOCK_NOW] = snapshot.bin
+            state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
+            state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
         update(self.grid_shape, self._operator, state)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
         state.encoded[:] = snapshot.encoded
+
+    def _check(self, snapshot: Snapshot) -> None:
+        state, operator = self._state, self._operator
+        if snapshot.fingerprint != self.encoder.fingerprint:
+            raise InputError(
+                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
+                f"{self.encoder.fingerprint[:12]}"
+            )
+        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, state.encoded)
+        for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
+            given = getattr(snapshot, name)
+            if given.dtype != array.dtype or given.shape != array.shape:
+                raise InputError(
+                    f"the snapshot holds {name} of {given.dtype} {given.shape}, this engine has "
+                    f"{array.dtype} {array.shape}"
+                )
+        # No solution exceeds half of it; one within the gap may, by a little.
+        if not (np.abs(snapshot.atoms) <= 2 * operator.largest).all():
+            raise InputError("the snapshot: an entry of a code is no number, or too large")
+        if min(snapshot.tally.min(), snapshot.encoded.min()) < 0:
+            raise InputError("the snapshot: something was counted less than zero times")
+        self._checked_time(snapshot.origin_us)
+        if snapshot.bin != BEFORE_TIME:
+            self._checked_time(snapshot.origin_us + snapshot.bin * operator.bin_us)

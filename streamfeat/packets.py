@@ -6,13 +6,14 @@ Not here: where messages come from (`recording`, `live`), what bytes they have (
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
-from streamfeat.codecs import MAX_PACKET_EVENTS, Decoder, encode, make_decoder
+from streamfeat.codecs import ENCODINGS, MAX_PACKET_EVENTS, Decoder, encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
+from streamfeat.json_fields import Fields
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 
 __all__ = ["EVENT_SCHEMAS", "Label", "Packet", "PacketReader", "PacketWriter", "Tick"]
@@ -125,6 +126,26 @@ class PacketReader:
         timed = packet.time_base and packet.encoding != "evt3"
         self.time_us = packet.time_base // 1000 if timed else None
         return Packet(self._topic, events, resolution, log_time_ns, packet.seq)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What decoders carry on, as JSON values."""
+        return {
+            "last_seq": self._last_seq,
+            "decoders": {name: decoder.snapshot() for name, decoder in self._decoders.items()},
+        }
+
+    def restore(self, values: Fields) -> None:
+        """Go on from a snapshot.
+
+        Raises:
+            InputError: it is none.
+        """
+        self._last_seq = values.maybe("last_seq", 0, 1 << 64)
+        decoders = values.inner("decoders")
+        for name in ENCODINGS:
+            if name in decoders:
+                self._decoders[name] = make_decoder(name, self._max_events)
+                self._decoders[name].restore(decoders.wholes(name, 8))
 
     def resync(self) -> None:
         """Messages are missing: what came before says nothing about what follows."""

@@ -6,7 +6,7 @@ Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, wh
 """
 
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,10 @@ from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.moment import Moment, SessionSnapshot, SessionStats
 from streamfeat.packets import Label, Packet, Tick
 
-__all__ = ["Session", "SessionStats", "StreamItem"]
+__all__ = ["Session", "StreamItem"]
 
 StreamItem = Packet | Label | Tick
 
@@ -29,33 +30,6 @@ _AHEAD_COLUMNS = 4096
 """Operator columns that are added at most to look ahead of a bin boundary: a fraction of a millisecond."""
 _AUTO_REST = 4.0
 """Under `auto`, time that passes after a reading, in multiples of what that reading took."""
-
-
-@dataclass(slots=True)
-class SessionStats:
-    """What a session has done.
-
-    Attributes:
-        events: accepted.
-        late: older than the window, or than the labelled sample that was open.
-        rejected: outside the sensor, or malformed.
-        saturated: accepted without changing a clipped count.
-        emissions: readings made.
-        incomplete: of those, how many lacked packets known to be missing from the window.
-        samples: labelled samples that ended.
-        correct: of those, how many were predicted rightly; None without a classifier.
-        unknown_labels: samples that could not be learned from, because the classifier lacks their label.
-    """
-
-    events: int = 0
-    late: int = 0
-    rejected: int = 0
-    saturated: int = 0
-    emissions: int = 0
-    incomplete: int = 0
-    samples: int = 0
-    correct: int | None = None
-    unknown_labels: int = 0
 
 
 class Session:
@@ -106,17 +80,9 @@ class Session:
         self._make_engine = engine
         self._every_event = policy == EmitPolicy("events", 1)
         self._engine: Engine | None = None
-        self._sample: Label | None = None
-        self._seen_label = False
-        self._origin = 0
-        self._last_us = 0
-        self._unread = 0
-        self._next_us: int | None = None
+        every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
+        self._at = Moment(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
-        self._epoch: int | None = None
-        self._silent_us = BEFORE_TIME
-        self._incomplete_us = BEFORE_TIME
-        self._lost = False
         self._log_time_ns = 0
         self._source_ns = 0
         self._stats = SessionStats(correct=0 if classifier else None)
@@ -128,10 +94,37 @@ class Session:
 
     def stats(self) -> SessionStats:
         """What has been done so far, a copy."""
-        total = SessionStats(**{name: getattr(self._stats, name) for name in SessionStats.__slots__})
+        total = replace(self._stats)
         if self._engine:
             _add_engine(total, self._engine)
         return total
+
+    def snapshot(self) -> SessionSnapshot:
+        """Copy the state; learning online is not part of it."""
+        engine = self._engine
+        return SessionSnapshot(
+            replace(self._at),
+            replace(self._stats),
+            engine.resolution if engine else None,
+            engine.snapshot() if engine else None,
+        )
+
+    def restore(self, snapshot: SessionSnapshot) -> None:
+        """Go on from a snapshot of a session with the same encoder; the policy may be another.
+
+        Raises:
+            InputError: it is of another encoder, or of no session at all. This one is no longer of use.
+        """
+        every_us, before = self._at.every_us, snapshot.moment
+        self._at = replace(before, every_us=every_us)
+        if before.every_us != every_us:
+            self._at.next_us = None
+        has_classifier, self._engine = self._stats.correct is not None, None
+        self._stats = replace(
+            snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
+        )
+        if snapshot.resolution and snapshot.engine:
+            self._engine_for(snapshot.resolution).restore(snapshot.engine)
 
     def process(self, item: StreamItem) -> Iterator[Emission]:
         """Take in one item of the stream, and yield what is read on the way."""
@@ -141,15 +134,15 @@ class Session:
             return
         if isinstance(item, Label):
             yield from self._finish_sample()
-            self._sample, self._seen_label = item, True
+            self._at.sample, self._at.seen_label = item, True
             self._start_anew(item.start_us)
             return
-        if self._epoch not in (None, item.epoch):
+        if self._at.epoch not in (None, item.epoch):
             yield from self._finish_sample()
             self._start_anew(0)
-            self._lost = True
-        self._epoch = item.epoch
-        self._lost |= item.lost > 0
+            self._at.lost = True
+        self._at.epoch = item.epoch
+        self._at.lost |= item.lost > 0
         self._log_time_ns, self._source_ns = item.log_time_ns, item.source_ns
         events = item.events
         if len(events) == 0:
@@ -157,15 +150,15 @@ class Session:
         engine = self._engine_for(item.resolution)
         sound = _sound(events, item.resolution)
         latest = self._stream_times(events, sound)
-        if self._lost:
+        if self._at.lost:
             # What is missing came before this packet, so it has left the window one window after it.
-            self._incomplete_us = max(self._incomplete_us, int(latest[0]) + self._window_us)
-            self._lost = False
+            self._at.incomplete_us = max(self._at.incomplete_us, int(latest[0]) + self._window_us)
+            self._at.lost = False
         end = len(events)
-        if self._sample:
-            stop = self._sample.start_us + self._sample.duration_us
+        if self._at.sample:
+            stop = self._at.sample.start_us + self._at.sample.duration_us
             end = int(np.searchsorted(latest, stop))
-            early = sound[:end] & (events["t"][:end] < self._sample.start_us)
+            early = sound[:end] & (events["t"][:end] < self._at.sample.start_us)
             if early.any():
                 self._stats.late += int(np.count_nonzero(early))
                 kept = np.concatenate([~early, np.ones(len(events) - end, np.bool_)])
@@ -186,48 +179,48 @@ class Session:
         """End the stream: the open sample is read, and what was collected is learned."""
         self._source_ns = 0
         yield from self._finish_sample()
-        if self._unread and self._engine:
-            yield self._read(self._engine, self._last_us + 1)
+        if self._at.unread and self._engine:
+            yield self._read(self._engine, self._at.last_us + 1)
         if self.learner:
             self.learner.flush()
 
     def _start_anew(self, origin_us: int) -> None:
         """Begin with an empty window whose bins start at the origin."""
-        self._origin = origin_us
-        self._last_us = origin_us
-        self._next_us = None
-        self._unread = 0
-        self._silent_us = self._incomplete_us = BEFORE_TIME
+        self._at.origin_us = origin_us
+        self._at.last_us = origin_us
+        self._at.next_us = None
+        self._at.unread = 0
+        self._at.silent_us = self._at.incomplete_us = BEFORE_TIME
         if self._engine:
             self._engine.restart(origin_us)
 
     def _pass_time(self, t_us: int) -> Iterator[Emission]:
         """Read what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
-        sample, engine = self._sample, self._engine
+        sample, engine = self._at.sample, self._engine
         if sample and t_us >= sample.start_us + sample.duration_us:
             yield from self._finish_sample()
-        if engine is None or (self._seen_label and not self._sample):
+        if engine is None or (self._at.seen_label and not self._at.sample):
             return
-        every = self.policy.every if self.policy.kind == "time" else self.encoder.geometry.bin_us
-        if self._next_us is None:
-            self._next_us = self._following(self._last_us, every)
+        every = self._at.every_us
+        if self._at.next_us is None:
+            self._at.next_us = self._following(self._at.last_us, every)
         while (due := self._due(t_us, every)) <= t_us:
             yield self._read(engine, due)
-            self._next_us = due + every
-            self._silent_us = due
+            self._at.next_us = due + every
+            self._at.silent_us = due
 
     def _stream_times(self, events: Events, sound: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Stream time after each event: it never goes back, and events that will be rejected have no say."""
         t = events["t"]
         if not sound.all():
             t = np.where(sound, t, BEFORE_TIME)
-        return np.maximum(np.maximum.accumulate(t), self._last_us)
+        return np.maximum(np.maximum.accumulate(t), self._at.last_us)
 
     def _engine_for(self, resolution: Resolution) -> Engine:
         if self._engine and self._engine.resolution == resolution:
             return self._engine
         engine = self._make_engine(
-            self.encoder, resolution, origin_us=self._origin, look_ahead=self._every_event
+            self.encoder, resolution, origin_us=self._at.origin_us, look_ahead=self._every_event
         )
         if self._engine:
             _add_engine(self._stats, self._engine)
@@ -253,14 +246,15 @@ class Session:
         Some events at a time, because that many calls from Python would cost far more.
         """
         start, before = 0, self._stats.events
+        self._at.next_us = None
         while start < len(events) and not self._is_behind(self._log_time_ns):
             traced = slice(start, min(start + _TRACE, len(events)))
             features, accepted = engine.trace(events[traced])
-            self._last_us = max(self._last_us, int(latest[traced][-1]))
+            self._at.last_us = max(self._at.last_us, int(latest[traced][-1]))
             times, scores = latest[traced].tolist(), self._scores(features)
             for i, n_events in enumerate(accepted.tolist()):
                 yield self._emission(times[i] + 1, before + n_events, features[i], scores[i])
-            self._unread = 0
+            self._at.unread = 0
             start = traced.stop
         return start
 
@@ -279,8 +273,8 @@ class Session:
         final: bool = False,
     ) -> Emission:
         # After a silence that was read, stream time as told by events may lie behind it.
-        t_us = max(t_us, self._silent_us)
-        incomplete = t_us <= self._incomplete_us
+        t_us = max(t_us, self._at.silent_us)
+        incomplete = t_us <= self._at.incomplete_us
         self._stats.emissions += 1
         self._stats.incomplete += incomplete
         classifier = self.classifier
@@ -290,7 +284,7 @@ class Session:
             features=features,
             labels=classifier.labels if classifier else (),
             scores=scores,
-            sample=self._sample,
+            sample=self._at.sample,
             final=final,
             topic=self._topic,
             incomplete=incomplete,
@@ -299,10 +293,10 @@ class Session:
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)
-        self._next_us = None
+        self._at.next_us = None
         now = self._clock()
         if now >= self._rest_until:
-            yield self._read(engine, self._last_us + 1)
+            yield self._read(engine, self._at.last_us + 1)
             spent = self._clock() - now
             self._rest_until = now + spent * (1 + _AUTO_REST)
 
@@ -311,13 +305,13 @@ class Session:
     ) -> Generator[Emission, None, int]:
         """Feed and read until all is done, or others wait; tells how many were fed."""
         start = 0
-        self._next_us = None
+        self._at.next_us = None
         while start < len(events) and not self._is_behind(self._log_time_ns):
-            stop = min(start + max(self.policy.every - self._unread, 1), len(events))
+            stop = min(start + max(self.policy.every - self._at.unread, 1), len(events))
             self._take(engine, events[start:stop], latest[start:stop])
             start = stop
-            if self._unread >= self.policy.every:
-                yield self._read(engine, self._last_us + 1)
+            if self._at.unread >= self.policy.every:
+                yield self._read(engine, self._at.last_us + 1)
         return start
 
     def _feed_by_time(
@@ -333,37 +327,39 @@ class Session:
                 start = stop
             else:
                 yield self._read(engine, due)
-                self._next_us = due + self.policy.every
+                self._at.next_us = due + self.policy.every
         return start
 
     def _following(self, t_us: int, every: int) -> int:
-        return t_us - (t_us - self._origin) % every + every
+        return t_us - (t_us - self._at.origin_us) % every + every
 
     def _due(self, t_us: int, every: int) -> int:
         """When to read next, given stream time `t_us`; readings of an empty window are passed over."""
         following = self._following(t_us, every)
-        if self._next_us is None:
-            self._next_us = following
+        if self._at.next_us is None:
+            self._at.next_us = following
         # After this nothing changes until the next event. Between labelled samples nobody asks.
-        silent = self._last_us + (0 if self._seen_label and not self._sample else self._window_us + every)
-        if self._next_us > silent and not self._unread:
-            self._next_us = following
-        return self._next_us
+        silent = self._at.last_us + (
+            0 if self._at.seen_label and not self._at.sample else self._window_us + every
+        )
+        if self._at.next_us > silent and not self._at.unread:
+            self._at.next_us = following
+        return self._at.next_us
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
         engine.feed(events)
-        self._unread += len(events)
-        self._last_us = max(self._last_us, int(latest[-1]))
+        self._at.unread += len(events)
+        self._at.last_us = max(self._at.last_us, int(latest[-1]))
 
     def _read(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
         engine.advance(t_us - 1)
         features = engine.features()
-        self._unread = 0
+        self._at.unread = 0
         scores = self._scores(features[np.newaxis])[0]
         return self._emission(t_us, self._stats.events + engine.n_events, features, scores, final=final)
 
     def _finish_sample(self) -> Iterator[Emission]:
-        sample = self._sample
+        sample = self._at.sample
         if sample is None:
             return
         self._stats.samples += 1
@@ -377,8 +373,8 @@ class Session:
                 self.learner.learn_one(emission.features, sample.label)
             else:
                 self._stats.unknown_labels += 1
-        self._sample = None
-        self._next_us = None
+        self._at.sample = None
+        self._at.next_us = None
         yield emission
 
 

@@ -14,7 +14,17 @@ PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
-    {"geometry", "files", "messages", "mcap_records", "svm", "simulate", "machine", "conventions"},
+    {
+        "geometry",
+        "files",
+        "json_fields",
+        "messages",
+        "mcap_records",
+        "svm",
+        "simulate",
+        "machine",
+        "conventions",
+    },
     {
         "kernels.code",
         "kernels.decode",
@@ -31,6 +41,7 @@ LAYERS = [
     {"window", "recorder", "emission"},
     {"encoder", "sinks", "report", "table", "terminal_view"},
     {"engine", "classifier", "features", "foreign", "learn"},
+    {"moment"},
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
@@ -51,9 +62,10 @@ ROOMS = {
     "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
     "live": [
         {"clock", "delivery", "inbox", "names"},
+        {"topic"},
         {"intake"},
         {"health", "network", "publisher"},
-        {"screen"},
+        {"keep", "screen"},
         {"listen", "publish", "record"},
     ],
     "evaluate": [

@@ -90,6 +90,10 @@ def listen(
     max_delay: Annotated[
         float, typer.Option(help="Seconds that packets may wait before the oldest are dropped.")
     ] = 1.0,
+    state: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Keep what is needed to go on after a crash in this file."),
+    ] = None,
     metrics: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
     ] = None,
@@ -118,6 +122,7 @@ def listen(
         port=port,
         metrics=metrics,
         max_delay_s=max_delay,
+        state=state,
         console=err,
     )
     to_terminal = str(json_lines) == "-"

@@ -4,7 +4,9 @@ Lives here: placing a packet's times on the stream's time.
 Not here: decoding (24-bit times of `evt3` are unwrapped there), and the engine, which sees sound time only.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+from streamfeat.json_fields import Fields
 
 __all__ = ["CameraClock", "Place"]
 
@@ -16,6 +18,7 @@ _JUMP_US = 60_000_000
 """More than this ahead, and more than twice the time that passed here, is a jump."""
 _BACK_US = 1_000_000
 """A fall of less than this, or than a window, is events out of order: late, perhaps, of the same clock."""
+_LATEST_US = 1 << 52
 
 
 class Place(NamedTuple):
@@ -49,6 +52,26 @@ class CameraClock:
         self._heard_ns = 0
         self._offset_us = 0
         self._epoch = 0
+
+    def snapshot(self, now_ns: int) -> dict[str, Any]:
+        """What is known of the camera's clock, as JSON values; times of ours as what has passed since."""
+        return {
+            "last_us": self._last_us,
+            "passed_ns": max(now_ns - self._heard_ns, 0),
+            "offset_us": self._offset_us,
+            "epoch": self._epoch,
+        }
+
+    def restore(self, values: Fields, now_ns: int) -> None:
+        """Go on from a snapshot.
+
+        Raises:
+            InputError: it is none.
+        """
+        self._last_us = values.maybe("last_us", 0, _LATEST_US)
+        self._heard_ns = now_ns - values.whole("passed_ns")
+        self._offset_us = values.whole("offset_us", 0, _LATEST_US)
+        self._epoch = values.whole("epoch")
 
     def place(self, first_us: int, last_us: int, now_ns: int) -> Place:
         """Place the next packet.

@@ -4,8 +4,11 @@ Lives here: gaps, duplicates, reordering, restarts, and two publishers on one ke
 Not here: clocks and sockets: times are given; nor what a packet holds.
 """
 
-from dataclasses import astuple, dataclass
-from typing import NamedTuple
+from dataclasses import asdict, astuple, dataclass, fields
+from typing import Any, NamedTuple
+
+from streamfeat.errors import InputError
+from streamfeat.json_fields import Fields
 
 __all__ = ["Delivery", "DeliveryStats", "Verdict"]
 
@@ -118,6 +121,34 @@ class Delivery:
         while len(self._missing) > _REMEMBERED:
             del self._missing[next(iter(self._missing))]
         return Verdict(use=True, lost=lost + dropped, broken=lost + dropped > 0)
+
+    def snapshot(self, now_ns: int) -> dict[str, Any]:
+        """What is known, as JSON values; times of ours as what has passed since."""
+        return {
+            "stats": asdict(self.stats),
+            "gid": None if self._gid is None else self._gid.hex(),
+            "passed_ns": max(now_ns - self._heard_ns, 0),
+            "next": self._next,
+            "missing": list(self._missing),
+        }
+
+    def restore(self, values: Fields, now_ns: int) -> None:
+        """Go on from a snapshot; whether publishers are there is for them to say.
+
+        Raises:
+            InputError: it is none.
+        """
+        stats = values.inner("stats")
+        # Packets that come late after all are taken from those that were lost.
+        counts = {field.name: stats.whole(field.name, -_FAR) for field in fields(DeliveryStats)}
+        self.stats = DeliveryStats(**counts)
+        try:
+            self._gid = bytes.fromhex(values.text("gid", 64)) if "gid" in values else None
+        except ValueError:
+            raise InputError(f"{values.where}: gid is not hexadecimal") from None
+        self._heard_ns = now_ns - values.whole("passed_ns")
+        self._next = values.whole("next", -(1 << 63), 1 << 63)
+        self._missing = dict.fromkeys(values.wholes("missing", _REMEMBERED, -(1 << 63)))
 
     def announced(self, *, here: bool) -> None:
         """The first publisher has come, or the last has left: whoever comes next takes over at once."""

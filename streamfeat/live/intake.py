@@ -8,37 +8,40 @@ pixels, and no more than 256 topics are followed at a time, so that memory is bo
 the inbox. What is refused is counted under its reason, with one line a second and reason at most.
 """
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from rich.console import Console
 
 from streamfeat.cameras import Gone
 from streamfeat.errors import InputError
-from streamfeat.events import Resolution
+from streamfeat.json_fields import Fields
 from streamfeat.live.clock import CameraClock
-from streamfeat.live.delivery import Delivery, DeliveryStats
+from streamfeat.live.delivery import DeliveryStats
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.names import Attachment
+from streamfeat.live.topic import (
+    MAX_LABEL_US,
+    MAX_PACKET_EVENTS,
+    MAX_PIXELS,
+    MAX_STREAM_US,
+    MAX_TOPICS,
+    Mark,
+    TopicState,
+)
 from streamfeat.messages import EventPacket, LabelMessage
 from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader, Tick
 
-__all__ = ["MAX_PACKET_EVENTS", "MAX_PAYLOAD_BYTES", "Intake", "TopicState", "Warnings"]
+__all__ = ["MAX_PAYLOAD_BYTES", "Intake", "Warnings"]
 
 MAX_PAYLOAD_BYTES = 4 << 20
-MAX_PACKET_EVENTS = 1 << 20
-MAX_PIXELS = 1 << 22
-"""The largest event sensors have 2^20."""
-MAX_TOPICS = 256
 _MAX_SPAN_US = 60_000_000
-_MAX_LABEL_US = 3_600_000_000
-_MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * _MAX_LABEL_US
-"""Times go into message stamps, which have 31 bits of seconds."""
 _POLL_S = 0.02
 _IDLE_S = 0.25
 _FORGOTTEN_NS = 60_000_000_000
@@ -46,6 +49,8 @@ SILENCE_S = 0.2
 """A camera that has been silent for so long is taken to have nothing to say, and its time goes on."""
 GRACE_S = 0.5
 """Who leaves is released when nothing has come for so long: zenoh may tell of it before the last packets."""
+_RESTORED_S = 10.0
+"""A camera of a snapshot is waited for so long: links come up again within a few seconds."""
 
 
 class Warnings:
@@ -85,37 +90,6 @@ class Warnings:
         self._say(f"{reason}: {topic}: {detail}" + (f" ({more} more of these)" if more else ""))
 
 
-@dataclass(slots=True)
-class TopicState:
-    """What is known of one topic.
-
-    Attributes:
-        reader: its decoders.
-        clock: of its camera.
-        delivery: of its packets.
-        resolution: of its latest packet.
-        packets: used.
-        payload_bytes: of those.
-        heard_ns: when the latest message came, by the monotonic clock.
-        stream_us: time that its events have reached; None before the first.
-        silent_s: how long it has been silent, as far as this process was awake.
-        label_end_us: end of the latest labelled sample.
-        lost: packets missing or refused since the latest one.
-    """
-
-    reader: PacketReader
-    clock: CameraClock
-    delivery: Delivery = field(default_factory=Delivery)
-    resolution: Resolution | None = None
-    packets: int = 0
-    payload_bytes: int = 0
-    heard_ns: int = 0
-    stream_us: int | None = None
-    silent_s: float = 0.0
-    label_end_us: int = 0
-    lost: int = 0
-
-
 class Intake:
     """An iterable of items for a pipeline, from an inbox; ends when the inbox is closed and empty.
 
@@ -124,10 +98,17 @@ class Intake:
         window_us: of the encoder; a silent camera's time goes on until its window is empty.
         warnings: told what is refused and what is strange.
         silence_s: how long a camera must be silent before its time goes on without it.
+        mark_s: how often to put a mark into the stream, if anything came meanwhile.
     """
 
     def __init__(
-        self, inbox: Inbox, window_us: int, warnings: Warnings, *, silence_s: float = SILENCE_S
+        self,
+        inbox: Inbox,
+        window_us: int,
+        warnings: Warnings,
+        *,
+        silence_s: float = SILENCE_S,
+        mark_s: float = math.inf,
     ) -> None:
         """Nothing is taken before iteration."""
         self._inbox = inbox
@@ -138,14 +119,46 @@ class Intake:
         self._past = DeliveryStats()
         self._early: dict[str, Label] = {}
         self._leaving: dict[str, float] = {}
+        self._awaited: dict[str, float] = {}
+        self._mark_s = mark_s
 
-    def __iter__(self) -> Iterator[Packet | Label | Tick | Gone | None]:
+    def snapshot(self) -> dict[str, dict[str, Any]]:
+        """What is known of each topic, as JSON values."""
+        now_ns = time.monotonic_ns()
+        return {topic: state.snapshot(now_ns) for topic, state in self.topics.items()}
+
+    def restore(self, topic: str, values: Fields, passed_ns: int) -> None:
+        """Go on with a topic from a snapshot, before anything is taken.
+
+        Its time stands still until it is heard; if that does not happen soon, it is gone.
+
+        Args:
+            topic: which.
+            values: what `snapshot` gave for it.
+            passed_ns: since then.
+
+        Raises:
+            InputError: it is none.
+        """
+        now_ns = time.monotonic_ns()
+        state = TopicState(PacketReader(topic, MAX_PACKET_EVENTS), CameraClock(self._window_us))
+        state.restore(values, now_ns - passed_ns)
+        state.heard_ns = now_ns
+        self.topics[topic] = state
+        self._awaited[topic] = 0.0
+
+    def __iter__(self) -> Iterator[Packet | Label | Tick | Gone | Mark | None]:
         """Yield items as they come; None when nothing more is there at the moment."""
-        looked = time.monotonic()
+        looked = marked = time.monotonic()
+        is_new = False
         while (taken := self._inbox.take(_POLL_S if self.topics else _IDLE_S)) is not None:
             for message in taken:
                 yield from self._items(message)
             now = time.monotonic()
+            is_new |= bool(taken)
+            if is_new and now >= marked + self._mark_s:
+                yield Mark(self.snapshot())
+                is_new, marked = False, now
             # Time during which this process was stopped says nothing about a camera's silence.
             passed_s = min(now - looked, 2 * _POLL_S)
             yield from self._silences(passed_s)
@@ -165,6 +178,7 @@ class Intake:
     def _announced(self, topic: str, *, here: bool) -> None:
         """Publishers come or leave. Who comes next is heard at once; who left may have packets under way."""
         self._leaving.pop(topic, None)
+        self._awaited.pop(topic, None)
         if not here:
             self._leaving[topic] = 0.0
             if len(self._leaving) > MAX_TOPICS:
@@ -180,6 +194,11 @@ class Intake:
         return Gone(topic)
 
     def _releases(self, passed_s: float) -> Iterator[Gone]:
+        for topic, awaited_s in list(self._awaited.items()):
+            self._awaited[topic] = awaited_s + passed_s
+            if awaited_s > _RESTORED_S:
+                del self._awaited[topic]
+                yield self._release(topic, self.topics[topic])
         for topic, silent_s in list(self._leaving.items()):
             self._leaving[topic] = silent_s + passed_s
             if silent_s > GRACE_S:
@@ -208,7 +227,7 @@ class Intake:
             label = Label.from_cdr(message.payload)
         except InputError as error:
             raise _RefusalError("bad label", str(error)) from None
-        if not 0 <= label.duration_us <= _MAX_LABEL_US:
+        if not 0 <= label.duration_us <= MAX_LABEL_US:
             raise _RefusalError("bad label", f"{label.label[:40]!r} lasts {label.duration_us} us")
         for topic in (parent, f"{parent}/events".lstrip("/"), f"{parent}/events"):
             state = self.topics.get(topic)
@@ -230,6 +249,7 @@ class Intake:
         if message.topic not in self.topics:
             yield from self._begin(message.topic)
         state = self.topics[message.topic]
+        self._awaited.pop(message.topic, None)
         attachment = Attachment.unpack(message.attachment)
         numbered = attachment or self._number_in(message)
         verdict = state.delivery.see(numbered.gid, numbered.seq, message.arrived_ns, message.dropped)
@@ -288,7 +308,7 @@ class Intake:
                 raise _RefusalError(
                     "bad times", f"events of one packet are {(last - first) // 1_000_000} s apart"
                 )
-            if first < 0 or last > _MAX_STREAM_US:
+            if first < 0 or last > MAX_STREAM_US:
                 raise _RefusalError("bad times", f"an event at {first if first < 0 else last} us")
             place = state.clock.place(first, last, message.arrived_ns)
             if place.event:
@@ -325,6 +345,7 @@ class Intake:
             if time.monotonic_ns() - self.topics[oldest].heard_ns < _FORGOTTEN_NS:
                 raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
             self._past = self._past + self.topics.pop(oldest).delivery.stats
+            self._awaited.pop(oldest, None)
             yield Gone(oldest)
         reader = PacketReader(topic, MAX_PACKET_EVENTS)
         state = self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
@@ -333,7 +354,7 @@ class Intake:
 
     def _silences(self, passed_s: float) -> Iterator[Tick]:
         for topic, state in self.topics.items():
-            if state.stream_us is None:
+            if state.stream_us is None or topic in self._awaited:
                 continue
             state.silent_s += passed_s
             now_us = state.stream_us + int((state.silent_s - self._silence_s) * 1e6)

@@ -4,6 +4,7 @@ Lives here: putting together what listening needs, and ending well.
 Not here: each of the parts.
 """
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -25,12 +26,14 @@ from streamfeat.events import make_events
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.keep import Keeper, read_state
 from streamfeat.live.names import Names, beside
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.publisher import OutputSink
 from streamfeat.live.screen import HealthTable
+from streamfeat.live.topic import Mark
 from streamfeat.packets import Packet
-from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.pipeline import Pipeline, Processor, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
 from streamfeat.session import Session, StreamItem
 from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
@@ -61,6 +64,8 @@ class Listen:
         silence_s: how long a camera must be silent before its time goes on without it.
         patience_s: how long packets may wait before readings are left out for them.
         max_delay_s: how long packets may wait before the oldest are dropped.
+        state: file to keep what is needed to go on after a crash; gone on from, if it exists.
+        state_every_s: how often it is written.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
@@ -83,6 +88,8 @@ class Listen:
         silence_s: float = SILENCE_S,
         patience_s: float = PATIENCE_S,
         max_delay_s: float = MAX_DELAY_S,
+        state: Path | None = None,
+        state_every_s: float = 1.0,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
@@ -104,9 +111,13 @@ class Listen:
         self._warnings = Warnings.on(console)
         self._inbox = Inbox(max_delay_s=max_delay_s)
         window_us = self._encoder.geometry.window_us
-        self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s)
+        mark_s = state_every_s if state else math.inf
+        self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s, mark_s=mark_s)
         self._cameras = Cameras(self._make_session, on_refusal=self._on_refusal)
         self.health = Health(self._cameras, self._intake, self._inbox, self._warnings)
+        self._state = state
+        if state and state.exists():
+            read_state(state, self._encoder.fingerprint, self._intake, self._cameras)
 
     def run(
         self,
@@ -157,8 +168,10 @@ class Listen:
                 partial(_recording_sink, recording_out) if recording_out else None,
                 partial(TableSink, table, self._encoder.n_features, labels) if table else None,
                 (lambda: more) if more else None,
+                self._keeper if self._state else None,
             )
-            pipeline: Pipeline[StreamItem | Gone, Emission] = Pipeline(self._intake, self.health, sinks)
+            processor: Processor[Any, Emission] = sinks[-1] if isinstance(sinks[-1], Keeper) else self.health
+            pipeline: Pipeline[StreamItem | Gone | Mark, Emission] = Pipeline(self._intake, processor, sinks)
             self.health.queues = pipeline.stats
             try:
                 if self._address:
@@ -212,6 +225,16 @@ class Listen:
             topic=topic,
             is_behind=is_behind or self._is_behind,
             engine=engine or self._engine_of(topic),
+        )
+
+    def _keeper(self) -> Keeper:
+        assert self._state
+        parts = self.health, self._cameras, self._intake
+        return Keeper(
+            self._state,
+            self._encoder.fingerprint,
+            *parts,
+            lambda error: self._warnings.add("state not kept", str(self._state), error),
         )
 
     def _is_behind(self, log_time_ns: int) -> bool:

@@ -19,9 +19,10 @@ from rich.console import Console
 from streamfeat.errors import InputError
 from streamfeat.live.delivery import Delivery, DeliveryStats
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import MAX_TOPICS, Warnings
+from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 from streamfeat.pipeline import Pipeline, run_until_interrupted
 from streamfeat.recorder import RecordingWriter
