@@ -5,13 +5,16 @@ Lives here: writing beside the target and renaming. Not here: any format.
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from streamfeat.errors import InputError
 
-__all__ = ["replacing", "write_atomically"]
+__all__ = ["replacing", "sweep", "write_atomically"]
+
+_SUFFIX = ".tmp"
 
 
 @contextlib.contextmanager
@@ -22,7 +25,7 @@ def replacing(path: Path) -> Iterator[Path]:
         InputError: the folder does not exist or cannot be written to.
     """
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        handle, name = tempfile.mkstemp(_SUFFIX, f".{path.name}.", path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot write there: {error.strerror}") from error
     os.close(handle)
@@ -48,6 +51,15 @@ def write_atomically(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def sweep(path: Path) -> None:
+    """Remove what writers of `path` that were killed have left beside it; for a file with one writer only."""
+    left = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]+{re.escape(_SUFFIX)}")
+    if path.parent.is_dir():
+        for other in path.parent.iterdir():
+            if left.fullmatch(other.name):
+                other.unlink(missing_ok=True)
 
 
 def _umask() -> int:

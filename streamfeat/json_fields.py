@@ -51,10 +51,10 @@ class Fields:
         """A text of at most so many characters."""
         return self._checked(name, str, lambda value: len(value) <= most)
 
-    def wholes(self, name: str, most: int, least: int = 0) -> list[int]:
-        """A list of at most `most` integers, none below `least`."""
-        values = self._checked(name, list, lambda value: len(value) <= most)
-        return [Fields({name: value}, self.where).whole(name, least) for value in values]
+    def wholes(self, name: str, longest: int, least: int = 0, most: int = _LARGEST) -> list[int]:
+        """A list of at most `longest` integers of `[least, most]`."""
+        values = self._checked(name, list, lambda value: len(value) <= longest)
+        return [Fields({name: value}, self.where).whole(name, least, most) for value in values]
 
     def inner(self, name: str) -> "Fields":
         """An object inside this one."""

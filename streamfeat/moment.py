@@ -16,7 +16,7 @@ from streamfeat.packets import Label
 
 __all__ = ["Moment", "SessionSnapshot", "SessionStats"]
 
-_LATEST_US = (1 << 32) * 1_000_000
+_LATEST_US = 1 << 52
 """No live stream gets there: message stamps have 31 bits of seconds."""
 
 

@@ -188,6 +188,7 @@ def test_topics(capsys, monkeypatch):
         (["listen", "--ros2", "a", "-m", "x"], "give its full name"),
         (["record", "a/events", "-o", "out.mcap", "--chunk", "0"], "a chunk of 0.0 s"),
         (["record", "a/events", "-o", "out.mcap", "--compression", "zip"], "unknown compression"),
+        (["listen", "a/events", "-m", "none", "--state", "x"], "no such file"),
         (["publish", "one.mcap"], "give each recording a key"),
         (["publish", "one.mcap", "a", "two.mcap", "a"], "a topic of its own"),
         (["publish", "none.mcap", "a/events"], "cannot be opened"),

@@ -16,6 +16,8 @@ _REMEMBERED = 1024
 """Missing numbers that a late packet can still fill in."""
 _FAR = 1 << 20
 """A step of more than this many numbers is not loss: the publisher counts from somewhere else."""
+_NUMBERS = 1 << 64
+"""No number is as large."""
 _SILENCE_NS = 500_000_000
 """A second publisher takes over when the first has been silent for so long."""
 _OLD_IN_A_ROW = 4
@@ -147,8 +149,8 @@ class Delivery:
         except ValueError:
             raise InputError(f"{values.where}: gid is not hexadecimal") from None
         self._heard_ns = now_ns - values.whole("passed_ns")
-        self._next = values.whole("next", -(1 << 63), 1 << 63)
-        self._missing = dict.fromkeys(values.wholes("missing", _REMEMBERED, -(1 << 63)))
+        self._next = values.whole("next", -_NUMBERS, _NUMBERS)
+        self._missing = dict.fromkeys(values.wholes("missing", _REMEMBERED, -_NUMBERS, _NUMBERS))
 
     def announced(self, *, here: bool) -> None:
         """The first publisher has come, or the last has left: whoever comes next takes over at once."""

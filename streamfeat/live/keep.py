@@ -26,6 +26,7 @@ from streamfeat.cameras import MAX_CAMERAS, Cameras, Gone
 from streamfeat.emission import Emission
 from streamfeat.engine import Snapshot
 from streamfeat.errors import InputError
+from streamfeat.files import sweep
 from streamfeat.json_fields import Fields
 from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.live.health import Health
@@ -89,6 +90,7 @@ class Keeper:
         self._ready: _Kept | None = None
         self._ends = False
         self._changed = threading.Condition()
+        sweep(path)
         self._thread = threading.Thread(target=self._keep, name="streamfeat state", daemon=True)
         self._thread.start()
 

@@ -101,6 +101,8 @@ class Listen:
             self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
         elif learn_online:
             raise InputError("--learn-online needs a classifier to start from; give one with -c")
+        if state and learn_online:
+            raise InputError("--state does not keep what --learn-online learns; give one of the two")
         self._address = parse_address(metrics) if metrics else None
         self._names = names
         self._learn_online, self._reliable = learn_online, reliable

@@ -32,6 +32,8 @@ MAX_TOPICS = 256
 MAX_LABEL_US = 3_600_000_000
 MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US
 """Times go into message stamps, which have 31 bits of seconds."""
+_LATEST_US = 1 << 52
+"""A clock that wraps can lead beyond that, if never so far."""
 
 
 @dataclass(slots=True)
@@ -86,8 +88,8 @@ class TopicState:
         self.clock.restore(values.inner("clock"), now_ns)
         self.delivery.restore(values.inner("delivery"), now_ns)
         self.resolution = resolution_in(values)
-        self.stream_us = values.maybe("stream_us", 0, MAX_STREAM_US)
-        self.label_end_us = values.whole("label_end_us", -MAX_STREAM_US, 2 * MAX_STREAM_US)
+        self.stream_us = values.maybe("stream_us", 0, _LATEST_US)
+        self.label_end_us = values.whole("label_end_us", -_LATEST_US, _LATEST_US)
         self.lost = values.whole("lost")
 
 
