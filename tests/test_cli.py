@@ -583,6 +583,7 @@ def test_interrupted_learning_writes_the_model_so_far(run, home, tmp_path, monke
     assert f"interrupted after 2 iterations; the same command with --resume {model}" in result.err
     assert result.json["iterations"] == 2
     assert Encoder.load(model).provenance["interrupted"] is True
+    assert list(tmp_path.iterdir()) == [model]
     said = run(*learn, "--resume", model)
     assert said.status == 0
     assert said.json["iterations"] > 2

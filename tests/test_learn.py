@@ -273,6 +273,23 @@ def test_an_interrupted_encoder_is_one_to_go_on_from(recording, tmp_path, formul
         assert rest.provenance["objective"][-1] == pytest.approx(whole.provenance["objective"][-1], rel=0.01)
 
 
+@pytest.mark.parametrize("formulation", ["direct", "inverse"])
+def test_what_is_kept_after_each_iteration_is_one_to_go_on_from(recording, formulation):
+    """As after Ctrl-C, for those who are not asked before they are killed."""
+    kept = []
+    setting = Setting(**LEARN | {"formulation": formulation, "iterations": 3})
+    whole = learn_encoder([recording], setting, keep=lambda make: kept.append(make()))
+    assert [(e.provenance["interrupted"], e.provenance["iterations"]) for e in kept] == [
+        (True, n) for n in (1, 2, 3)
+    ]
+    assert kept[2].fingerprint == whole.fingerprint
+    stopped = learn(recording, formulation=formulation, iterations=3, report=interrupt_at(2))
+    assert (kept[1].fingerprint, kept[1].provenance) == (stopped.fingerprint, stopped.provenance)
+    rest = learn(recording, resume=kept[1], formulation=formulation, iterations=1)
+    if formulation == "direct":
+        assert (rest.fingerprint, rest.provenance) == (whole.fingerprint, whole.provenance)
+
+
 def test_an_interruption_before_anything_was_learned_gives_no_encoder(recording):
     def report(step, done, total, remark):
         if step == "reading windows":

@@ -5,8 +5,10 @@ Not here: the learning itself (`learn`, `classifier`).
 """
 
 import contextlib
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -29,7 +31,14 @@ from streamfeat.cli.program import (
 )
 from streamfeat.errors import InputError
 
+if TYPE_CHECKING:
+    from streamfeat.encoder import Encoder
+    from streamfeat.learn.fit import Keep
+
 __all__ = ["learn", "train"]
+
+_KEEP_REST = 19
+"""Time that passes after a model was kept, in multiples of what that took."""
 
 
 @app.command(epilog="Example: streamfeat learn recordings/digits_train.mcap -o model.safetensors")
@@ -68,6 +77,7 @@ def learn(
     """Learn features without labels; samples of validation and test splits are not looked at.
 
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
+    After a crash there is the file MODEL.part, which --resume takes as well.
     """
     from streamfeat.encoder import Encoder
     from streamfeat.learn.fit import learn_encoder
@@ -77,14 +87,16 @@ def learn(
     refuse_existing(model, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
+    part = model.with_name(model.name + ".part")
     try:
         with contextlib.ExitStack() as files, progress_bars(quiet=quiet, as_lines=verbose) as report:
             opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
-            encoder = learn_encoder(opened, setting, resume=before, report=report)
+            encoder = learn_encoder(opened, setting, resume=before, report=report, keep=_keeper(part))
     except KeyboardInterrupt:
         err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
         raise typer.Exit(130) from None
     encoder.save(model)
+    part.unlink(missing_ok=True)
     result = {
         "written": str(model),
         "formulation": encoder.formulation,
@@ -114,6 +126,20 @@ def learn(
             soft_wrap=True,
         )
         raise typer.Exit(130)
+
+
+def _keeper(path: Path) -> "Keep":
+    """Keep what was learned so far in a file, as often as that takes no more than a twentieth of the time."""
+    due = 0.0
+
+    def keep(make: Callable[[], "Encoder"]) -> None:
+        nonlocal due
+        started = time.monotonic()
+        if started >= due:
+            make().save(path)
+            due = time.monotonic() + _KEEP_REST * (time.monotonic() - started)
+
+    return keep
 
 
 @app.command(

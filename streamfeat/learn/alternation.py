@@ -43,7 +43,7 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         chunk_size: volumes whose codes are held as floats at a time.
         warm_start: start from `components_` of the fit before.
         random_state: seed of the initial rows.
-        progress: called with (iteration, objective) after each iteration.
+        progress: called with (iteration, objective) after each iteration, whose attributes are there then.
     """
 
     max_iter: int = 20
@@ -71,13 +71,14 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         condition: list[float] = []
         coherence: list[float] = []
         self.interrupted_ = False
+        self._keep(rows, objective, condition, coherence)
         try:
             for step in islice(self._alternate(volumes, squares, rows), self.max_iter):
                 shown = condition_number(step.rows), mutual_coherence(step.rows)
-                rows = step.rows
                 objective += [step.after_codes, step.after_rows]
                 condition.append(shown[0])
                 coherence.append(shown[1])
+                self._keep(step.rows, objective, condition, coherence)
                 if self.progress:
                     self.progress(len(condition), step.after_rows)
                 gained = objective[-3] - objective[-1] if len(objective) > 2 else np.inf
@@ -85,12 +86,21 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                     break
         except KeyboardInterrupt:
             self.interrupted_ = True
+        return self
+
+    def _keep(
+        self,
+        rows: NDArray[np.float32],
+        objective: list[float],
+        condition: list[float],
+        coherence: list[float],
+    ) -> None:
+        """What was found so far is what was found, whatever comes next; nothing else changes it."""
         self.components_ = rows
         self.objective_ = np.array(objective)
         self.condition_ = np.array(condition)
         self.coherence_ = np.array(coherence)
         self.n_iter_ = len(condition)
-        return self
 
     def _check(self, n_volumes: int) -> None:
         """Refuse parameters that cannot be used; subclasses check theirs as well."""

@@ -37,6 +37,9 @@ _WHOLE = 0.95
 Report = Callable[[str, int, int, str], None]
 """Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
 
+Keep = Callable[[Callable[[], Encoder]], None]
+"""Called after each iteration with a function that makes the encoder so far."""
+
 
 def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
     """The geometry that a setting means for these recordings.
@@ -128,6 +131,7 @@ def learn_encoder(
     *,
     resume: Encoder | None = None,
     report: Report = lambda step, done, total, remark: None,
+    keep: Keep = lambda make: None,
 ) -> Encoder:
     """Learn an encoder without labels; samples of held-out splits are not looked at.
 
@@ -139,6 +143,7 @@ def learn_encoder(
         setting: geometry and learning; iterations are those beyond `resume`.
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.
+        keep: may keep what was learned so far, which says of itself that it was interrupted.
 
     Raises:
         InputError: no usable volume was found, there are too few, a parameter is out of range, or `resume`
@@ -158,8 +163,31 @@ def learn_encoder(
             "recordings, the number of volumes and the seed that it was learned with, or learn anew"
         )
 
+    def made(*, interrupted: bool = True) -> Encoder:
+        provenance: dict[str, Any] = {
+            "recordings": [recording.path.name for recording in recordings],
+            "windows": volumes.windows,
+            "volumes": len(volumes.counts),
+            "volumes_sha256": volumes_hash,
+            "empty_share": round(volumes.empty_share, 4),
+            "seed": setting.seed,
+            "weights": weights,
+            "iterations": learner.n_iter_,
+            "interrupted": interrupted,
+            "objective": _rounded(learner.objective_),
+            "condition": _rounded(learner.condition_),
+            "coherence": _rounded(learner.coherence_),
+            "unused": learner.unused_,
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        }
+        if resume:
+            for name in _HISTORY:
+                provenance[name] = resume.provenance[name] + provenance[name]
+        return material.encoder(learner.components_, provenance)
+
     def learned(iteration: int, objective: float) -> None:
         report("learning", iteration, setting.iterations, f"objective {objective:.4f}")
+        keep(made)
 
     learner.set_params(progress=learned)
     if resume:
@@ -167,26 +195,7 @@ def learn_encoder(
     learner.fit(material.white)
     if learner.interrupted_ and learner.n_iter_ == 0:
         raise KeyboardInterrupt
-    provenance: dict[str, Any] = {
-        "recordings": [recording.path.name for recording in recordings],
-        "windows": volumes.windows,
-        "volumes": len(volumes.counts),
-        "volumes_sha256": volumes_hash,
-        "empty_share": round(volumes.empty_share, 4),
-        "seed": setting.seed,
-        "weights": weights,
-        "iterations": learner.n_iter_,
-        "interrupted": learner.interrupted_,
-        "objective": _rounded(learner.objective_),
-        "condition": _rounded(learner.condition_),
-        "coherence": _rounded(learner.coherence_),
-        "unused": learner.unused_,
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-    }
-    if resume:
-        for name in _HISTORY:
-            provenance[name] = resume.provenance[name] + provenance[name]
-    return material.encoder(learner.components_, provenance)
+    return made(interrupted=learner.interrupted_)
 
 
 def _learner(setting: Setting) -> TransformLearner | DictionaryLearner:
