@@ -19,9 +19,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
+from tools.torture.kills import kills  # noqa: E402
 from tools.torture.table import Part, Row, Trials, markdown  # noqa: E402
 
-PARTS: dict[str, tuple[Part, str]] = {}
+PARTS: dict[str, tuple[Part, str]] = {
+    "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
