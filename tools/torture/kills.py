@@ -5,7 +5,6 @@ Lives here: what each command was asked to make, and what must be there when it 
 
 import json
 import shutil
-import socket
 import struct
 import threading
 import time
@@ -30,7 +29,7 @@ from streamfeat.packets import Label
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import open_recording
 from streamfeat.simulate import Saccades, digit_samples
-from tools.torture.nursery import Nursery
+from tools.torture.nursery import Nursery, free_port
 from tools.torture.table import Row, Trials
 
 __all__ = ["kills"]
@@ -339,7 +338,7 @@ def _record_once(
     old = b"an earlier recording"
     if has_before:
         target.write_bytes(old)
-    port = _free_port()
+    port = free_port()
     words = ["record", "cam/events", "-o", target, "--port", port, "--chunk", _CHUNK_S]
     with open_session(port=port) as session, _Camera(session) as camera:
         child = nursery.start([*words, *(["--overwrite"] if has_before else [])], folder / "log")
@@ -424,9 +423,3 @@ class _Camera:
             attached = struct.pack("<qqB16s", self.n_put + 1, 0, 16, b"torture's camera")
             self._publisher.put(packet.to_cdr(), attachment=attached)
             self.n_put += 1
-
-
-def _free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])

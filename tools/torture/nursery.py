@@ -7,6 +7,7 @@ into what a command does, not into what Python imports.
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,14 +16,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-__all__ = ["Child", "Nursery"]
+__all__ = ["Child", "Nursery", "free_port"]
 
 _MOTHER = """
 import json, os, sys
 import numba, numpy, scipy.optimize, sklearn.linear_model, sklearn.model_selection, zenoh
 import streamfeat.cli, streamfeat.classifier, streamfeat.features, streamfeat.foreign.datasets
 import streamfeat.evaluate.run, streamfeat.evaluate.words, streamfeat.learn.fit, streamfeat.live.listen
-import streamfeat.live.record
+import streamfeat.live.record, tools.torture.state
 
 for line in sys.stdin:
     task = json.loads(line)
@@ -36,7 +37,10 @@ for line in sys.stdin:
         sys.argv = ["streamfeat", *task["words"]]
         status = 1
         try:
-            streamfeat.cli.main()
+            if task["words"][0] == "@listener":
+                tools.torture.state.listener(task["words"][1:])
+            else:
+                streamfeat.cli.main()
             status = 0
         except SystemExit as ended:
             status = ended.code or 0
@@ -113,3 +117,10 @@ class Child:
     def said(self) -> Any:
         """The JSON that it printed last."""
         return json.loads(self.log.read_text().strip().splitlines()[-1])
+
+
+def free_port() -> int:
+    """A TCP port that nobody uses at the moment."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
