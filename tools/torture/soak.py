@@ -215,9 +215,10 @@ class _Watch:
             if name != "t_us" and other - one > (_GROWTH if name == "rss" else 0)
         ]
         mb = [f"{value / 1e6:.1f}" for value in (*middle["rss"], middle["state"][1])]
+        files, threads = middle["files"], middle["threads"]
         note = (
-            f"first to last hour: RSS {mb[0]} to {mb[1]} MB, {middle['files'][0]} to {middle['files'][1]} files, "
-            f"{middle['threads'][0]} to {middle['threads'][1]} threads; engine {mb[2]} MB"
+            f"first to last hour: RSS {mb[0]} to {mb[1]} MB, {files[0]} to {files[1]} files, "
+            f"{threads[0]} to {threads[1]} threads; engine {mb[2]} MB"
         )
         return Row(
             f"{what}: what the process holds", 1, int(not failures), note=note, failures=tuple(failures)
