@@ -254,6 +254,7 @@ def run_until_interrupted(
         loop = asyncio.get_running_loop()
         # Only the main thread of a process can be told of signals.
         names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+        before = {name: signal.getsignal(name) for name in names}
         for name in names:
             loop.add_signal_handler(name, on_signal)
         try:
@@ -263,8 +264,9 @@ def run_until_interrupted(
         except BaseExceptionGroup as group:
             raise group.exceptions[0] from None
         finally:
-            for name in names:
+            for name, handler in before.items():
                 loop.remove_signal_handler(name)
+                signal.signal(name, handler)
 
     asyncio.run(run())
     return interrupted

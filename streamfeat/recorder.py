@@ -161,8 +161,15 @@ class RecordingWriter:
             raise
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system, so that a crash cannot take it."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        """Hand everything written so far to the operating system, so that a crash cannot take it.
+
+        Raises:
+            InputError: there is no room for it.
+        """
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise self._unwritable(error) from None
 
     def write_events(self, events: Events, resolution: Resolution) -> None:
         """Write a batch as one or more packets, each at the time of its first event.

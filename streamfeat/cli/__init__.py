@@ -5,7 +5,9 @@ Not here: anything another program might want to call. Commands import what they
 `--help` does not wait for it.
 """
 
+import signal
 import sys
+from types import FrameType
 from typing import NoReturn
 
 from rich.markup import escape
@@ -29,7 +31,11 @@ __all__ = [
 
 
 def main() -> NoReturn:
-    """Run the command line; what the user can mend ends with one line and exit status 2."""
+    """Run the command line; what the user can mend ends with one line and exit status 2.
+
+    SIGTERM ends a command as Ctrl-C does: with what is done written, and nothing half written.
+    """
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         app()
     except InputError as error:
@@ -38,4 +44,10 @@ def main() -> NoReturn:
     except MemoryError as error:
         err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
     sys.exit(0)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -81,13 +81,21 @@ class StateFile:
         return self._done.get(_name(cell.key))
 
     def add(self, cell: Cell, result: dict[str, Any]) -> None:
-        """Keep a result; it is on disk when this returns."""
+        """Keep a result; it is on disk when this returns.
+
+        Raises:
+            InputError: there is no room for it.
+        """
         self._done[_name(cell.key)] = result
-        if self._path is not None:
+        if self._path is None:
+            return
+        try:
             with self._path.open("ab") as file:
                 file.write(_line({"cell": cell.key, "result": result}))
                 file.flush()
                 os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot be written: {error.strerror}; is there room?") from error
 
 
 def _name(key: dict[str, Any]) -> str:

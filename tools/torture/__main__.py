@@ -19,6 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
+from tools.torture.faults import faults  # noqa: E402
 from tools.torture.kills import kills  # noqa: E402
 from tools.torture.soak import soak  # noqa: E402
 from tools.torture.state import state  # noqa: E402
@@ -27,6 +28,7 @@ from tools.torture.table import Part, Row, Trials, markdown  # noqa: E402
 PARTS: dict[str, tuple[Part, str]] = {
     "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
     "state": (state, "kill -9 of a listener that keeps its state"),
+    "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
     "soak": (soak, "a day of stream time, 500 million events"),
 }
 

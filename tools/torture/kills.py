@@ -5,8 +5,6 @@ Lives here: what each command was asked to make, and what must be there when it 
 
 import json
 import shutil
-import struct
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,29 +12,20 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-import zenoh
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from streamfeat.classifier import Classifier
-from streamfeat.codecs import encode
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
-from streamfeat.events import make_events
 from streamfeat.live.network import open_session
-from streamfeat.messages import EventPacket
-from streamfeat.packets import Label
-from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import open_recording
-from streamfeat.simulate import Saccades, digit_samples
 from tools.torture.nursery import Nursery, free_port
+from tools.torture.sources import MODEL, ROOT, TRAIN, Camera, digits, folder_of_samples
 from tools.torture.table import Row, Trials
 
 __all__ = ["kills"]
 
-ROOT = Path(__file__).resolve().parents[2]
-TRAIN = ROOT / "recordings" / "digits_train.mcap"
-MODEL = ROOT / "recordings" / "digits.safetensors"
 _TIMES = 40
 _ITERATIONS = 12
 _LEARN = [
@@ -208,7 +197,7 @@ def _learn(nursery: Nursery, trials: Trials) -> _Command:
 
 
 def _train(nursery: Nursery, trials: Trials) -> _Command:
-    words: list[object] = [_digits(trials.folder / "some.mcap", 120), "-m", MODEL, "--json"]
+    words: list[object] = [digits(trials.folder / "some.mcap", 120), "-m", MODEL, "--json"]
 
     def is_whole(path: Path) -> bool:
         Classifier.load(path).check_fits(Encoder.load(MODEL))
@@ -222,14 +211,8 @@ def _train(nursery: Nursery, trials: Trials) -> _Command:
 
 
 def _convert(nursery: Nursery, trials: Trials) -> _Command:
-    source = trials.folder / "data"
-    rng = np.random.default_rng(trials.seed)
-    for i in range(400):
-        folder = source / ("Train" if i % 4 else "Test") / str(i % 10)
-        folder.mkdir(parents=True, exist_ok=True)
-        t = np.sort(rng.integers(0, 100_000, 3000))
-        columns = {"x": rng.integers(0, 34, 3000), "y": rng.integers(0, 34, 3000)}
-        np.savez(folder / f"{i}.npz", **columns, p=rng.integers(0, 2, 3000), t=t)
+    n = 400
+    source = folder_of_samples(trials.folder / "data", n, trials.seed)
 
     def is_whole(path: Path) -> bool:
         with open_recording(path) as recording:
@@ -256,7 +239,7 @@ def _convert(nursery: Nursery, trials: Trials) -> _Command:
 
 def _evaluate(nursery: Nursery, trials: Trials) -> _Command:
     methods = [word for method in _METHODS for word in ("--method", method)]
-    words: list[object] = [_digits(trials.folder / "few.mcap", 60), *_EVALUATE, *methods]
+    words: list[object] = [digits(trials.folder / "few.mcap", 60), *_EVALUATE, *methods]
     accuracies: list[list[float]] = []
 
     def is_whole(path: Path) -> bool:
@@ -283,18 +266,6 @@ def _evaluate(nursery: Nursery, trials: Trials) -> _Command:
     return _Command(
         "evaluate", words, "result.json", is_whole, go_on, "the same command goes on, cell by cell"
     )
-
-
-def _digits(path: Path, n: int) -> Path:
-    """Simulated digits as a labelled recording; every third is held out."""
-    with RecordingWriter(path) as writer:
-        for i, sample in enumerate(digit_samples(n, 0, "train", saccades=Saccades(saccade_us=33_000))):
-            start = 200_000 + 300_000 * i
-            writer.write_label(Label(start, 100_000, sample.label, "test" if i % 3 == 0 else "train"))
-            moved = sample.events.copy()
-            moved["t"] += start
-            writer.write_events(moved, (34, 34))
-    return path
 
 
 # --- recording, which writes what others send
@@ -340,7 +311,7 @@ def _record_once(
         target.write_bytes(old)
     port = free_port()
     words = ["record", "cam/events", "-o", target, "--port", port, "--chunk", _CHUNK_S]
-    with open_session(port=port) as session, _Camera(session) as camera:
+    with open_session(port=port) as session, Camera(session) as camera:
         child = nursery.start([*words, *(["--overwrite"] if has_before else [])], folder / "log")
         limit = time.monotonic() + 60
         while not camera.is_heard and time.monotonic() < limit:
@@ -381,45 +352,3 @@ def _messages_in_whole_chunks(path: Path) -> int:
     except Exception:
         return n
     return n
-
-
-class _Camera:
-    """Puts a packet every 10 ms; a context manager."""
-
-    EVENTS, STEP_US = 200, 10_000
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self._publisher = session.declare_publisher(
-            "cam/events", congestion_control=zenoh.CongestionControl.BLOCK
-        )
-        self.n_put = 0
-        self._ends = threading.Event()
-        self._thread = threading.Thread(target=self._put)
-
-    @property
-    def is_heard(self) -> bool:
-        return bool(self._publisher.matching_status.matching)
-
-    def __enter__(self) -> "_Camera":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._ends.set()
-        self._thread.join()
-
-    def events(self, i: int):
-        rng = np.random.default_rng(i)
-        n = self.EVENTS
-        t = np.sort(rng.integers(i * self.STEP_US, (i + 1) * self.STEP_US, n))
-        return make_events(rng.integers(0, 64, n), rng.integers(0, 48, n), rng.integers(0, 2, n), t)
-
-    def _put(self) -> None:
-        while not self._ends.wait(self.STEP_US / 1e6):
-            if not self.is_heard:
-                continue
-            payload, base_ns = encode(self.events(self.n_put), "mono")
-            packet = EventPacket(0, "", 48, 64, self.n_put, base_ns, "mono", False, payload)
-            attached = struct.pack("<qqB16s", self.n_put + 1, 0, 16, b"torture's camera")
-            self._publisher.put(packet.to_cdr(), attachment=attached)
-            self.n_put += 1
