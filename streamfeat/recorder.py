@@ -6,6 +6,7 @@ Not here: reading (`streamfeat.recording`), what bytes a message has (`streamfea
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -289,6 +290,8 @@ class RecordingWriter:
             raise InputError(f"{self.path}: exists already; choose another name or allow to overwrite it")
 
     def _abandon(self) -> None:
-        self._file.close()
+        # What is still buffered may be what there is no room for.
+        with suppress(OSError):
+            self._file.close()
         if not self._keep_partial:
             self._part.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ from typing import Any, Self
 __all__ = ["Child", "Nursery", "free_port"]
 
 _MOTHER = """
-import json, os, sys
+import json, os, sys, traceback
 import numba, numpy, scipy.optimize, sklearn.linear_model, sklearn.model_selection, zenoh
 import streamfeat.cli, streamfeat.classifier, streamfeat.features, streamfeat.foreign.datasets
 import streamfeat.evaluate.run, streamfeat.evaluate.words, streamfeat.learn.fit, streamfeat.live.listen
@@ -44,6 +44,8 @@ for line in sys.stdin:
             status = 0
         except SystemExit as ended:
             status = ended.code or 0
+        except BaseException:
+            traceback.print_exc()
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
