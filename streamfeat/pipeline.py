@@ -21,7 +21,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -34,7 +34,7 @@ import numpy as np
 from streamfeat.packets import Label, Packet
 from streamfeat.sinks import Sink
 
-__all__ = ["Pipeline", "PipelineStats", "Processor", "run_until_interrupted"]
+__all__ = ["Pipeline", "PipelineStats", "Processor", "run_until_interrupted", "signals_wait"]
 
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -227,6 +227,22 @@ class Pipeline(Generic[In, Out]):
             self._under_way -= 1
 
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def signals_wait() -> Iterator[None]:
+    """SIGINT and SIGTERM wait until `run_until_interrupted` can hear them, or until the block ends.
+
+    For opening sinks: a signal between opening them and running would leave half an output behind.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def run_until_interrupted(
     pipelines: Sequence[Pipeline[In, Out]], interrupt: Callable[[], None] | None = None
 ) -> bool:
@@ -253,10 +269,11 @@ def run_until_interrupted(
     async def run() -> None:
         loop = asyncio.get_running_loop()
         # Only the main thread of a process can be told of signals.
-        names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+        names = _SIGNALS if current_thread() is main_thread() else ()
         before = {name: signal.getsignal(name) for name in names}
         for name in names:
             loop.add_signal_handler(name, on_signal)
+        mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, names)
         try:
             async with asyncio.TaskGroup() as tasks:
                 for pipeline in pipelines:
@@ -264,6 +281,7 @@ def run_until_interrupted(
         except BaseExceptionGroup as group:
             raise group.exceptions[0] from None
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             for name, handler in before.items():
                 loop.remove_signal_handler(name)
                 signal.signal(name, handler)

@@ -19,7 +19,7 @@ from streamfeat.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.mcap_records import Losses
-from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.pipeline import Pipeline, run_until_interrupted, signals_wait
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label, Packet, Recording, open_recording
 from streamfeat.session import Session
@@ -116,7 +116,7 @@ class Replay:
             report: called with (step, done, of how many, remark) as packets and labels are read, from a
                 thread.
         """
-        with open_recording(self._recording, self._topic) as rec:
+        with open_recording(self._recording, self._topic) as rec, signals_wait():
             self._played = rec
             sinks = open_sinks(
                 partial(TerminalSink, console, every_sample=every_sample) if console else None,

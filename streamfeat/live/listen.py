@@ -33,7 +33,7 @@ from streamfeat.live.publisher import OutputSink
 from streamfeat.live.screen import HealthTable
 from streamfeat.live.topic import Mark
 from streamfeat.packets import Packet
-from streamfeat.pipeline import Pipeline, Processor, run_until_interrupted
+from streamfeat.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
 from streamfeat.recorder import RecordingWriter
 from streamfeat.session import Session, StreamItem
 from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
@@ -160,6 +160,7 @@ class Listen:
         with (
             open_session(self._zenoh_config, port=self._port) as session,
             screen if is_screen else nullcontext(),
+            signals_wait(),
         ):
             sinks = open_sinks(
                 partial(OutputSink, session, self._names, self.health.on_published) if publish else None,

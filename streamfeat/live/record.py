@@ -24,7 +24,7 @@ from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
-from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.pipeline import Pipeline, run_until_interrupted, signals_wait
 from streamfeat.recorder import RecordingWriter
 from streamfeat.sinks import open_sinks
 
@@ -95,7 +95,7 @@ class Record:
         Raises:
             InputError: the file cannot be written, or the network not be used.
         """
-        with open_session(self._zenoh_config, port=self._port) as session:
+        with open_session(self._zenoh_config, port=self._port) as session, signals_wait():
             (sink,) = open_sinks(
                 lambda: _MessageSink(
                     RecordingWriter(

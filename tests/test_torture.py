@@ -1,0 +1,50 @@
+"""The tool that breaks things, with a trial or two of each kind: it runs, counts, and all survives."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1]))
+
+from tools.torture import __main__ as torture
+from tools.torture import kills, soak
+from tools.torture.nursery import Nursery
+from tools.torture.table import Row, Trials, markdown
+
+
+@pytest.fixture
+def trials(tmp_path):
+    return Trials(0.001, 1, tmp_path, lambda line: None)
+
+
+def survived(rows):
+    for row in rows:
+        assert row.tried > 0
+        assert (row.survived, row.failures) == (row.tried, ())
+
+
+def test_commands_that_are_killed(trials, monkeypatch):
+    """One each of those that are quick; all of them are in the full run."""
+    monkeypatch.setattr(kills, "_METHODS", ("counts",))
+    with Nursery(kills.ROOT) as nursery:
+        commands = [make(nursery, trials) for make in (kills._convert, kills._evaluate)]
+        survived([kills._try(nursery, trials, command) for command in commands])
+
+
+def test_a_short_soak(trials):
+    rows = soak.soak(trials)
+    survived(rows[:2])
+    assert "60 packets" not in markdown(rows)
+    assert "1,966,080 events" in rows[0].fault
+
+
+def test_rows_become_a_table_and_json_and_failures_an_exit_status(monkeypatch, tmp_path, capsys):
+    rows = [Row("this", 10, 10, 5, 40, 0.25, 1.0, "a note"), Row("that", 3, 2, failures=("once",))]
+    monkeypatch.setattr(torture, "PARTS", {"one": (lambda trials: rows, "of a kind")})
+    assert torture.main(["--json", str(tmp_path / "out.json")]) == 1
+    said = capsys.readouterr().out
+    assert "| this (a note) | 10 | 10 | 5 | 40 | 0.25 s | 1 s |" in said
+    assert "FAILED: that: once" in said
+    assert [row["survived"] for row in json.loads((tmp_path / "out.json").read_text())] == [10, 2]
