@@ -41,7 +41,7 @@ def faults(trials: Trials) -> list[Row]:
     """Rows for full disks, signals, sinks and tasks."""
     few = digits(trials.folder / "few.mcap", 60)
     data = folder_of_samples(trials.folder / "data", 60, trials.seed)
-    replay: list[object] = ["replay", few, "-m", MODEL, "--emit", "event", "-q"]
+    replay: list[object] = ["replay", few, "-m", MODEL, "--emit", "100ev", "-q"]
     commands: dict[str, list[object]] = {
         "replay -o": [*replay, "-o"],
         "replay --json-lines": [*replay, "--json-lines"],

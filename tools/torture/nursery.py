@@ -61,6 +61,8 @@ class Nursery:
     """Runs one command at a time; a context manager."""
 
     def __init__(self, root: Path) -> None:
+        self._pid = 0
+        """Of the command that runs; its number stays its own until it is collected."""
         self._mother = subprocess.Popen(
             [sys.executable, "-c", _MOTHER],
             stdin=subprocess.PIPE,
@@ -75,12 +77,15 @@ class Nursery:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._pid:
+            os.kill(self._pid, signal.SIGKILL)
         self._mother.kill()
         self._mother.communicate()
 
     def start(self, words: Sequence[object], log: Path) -> "Child":
         self._say(json.dumps({"words": [str(word) for word in words], "log": str(log)}))
-        return Child(int(self._heard()), log, self)
+        self._pid = int(self._heard())
+        return Child(self._pid, log, self)
 
     def run(self, words: Sequence[object], log: Path) -> tuple[int, float]:
         """Run to the end: exit status and seconds."""
@@ -114,6 +119,7 @@ class Child:
 
     def wait(self) -> int:
         self._nursery._say("")
+        self._nursery._pid = 0
         return int(self._nursery._heard())
 
     def said(self) -> Any:
