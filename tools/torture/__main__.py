@@ -19,9 +19,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
+from tools.torture.fuzz import hostile_bytes  # noqa: E402
 from tools.torture.table import Part, Row, Trials, markdown  # noqa: E402
 
-PARTS: dict[str, tuple[Part, str]] = {}
+PARTS: dict[str, tuple[Part, str]] = {
+    "bytes": (hostile_bytes, "every decoder, fed with hostile bytes"),
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
