@@ -15,7 +15,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 
-__all__ = ["EVENT_SCHEMAS", "Label", "Packet", "PacketReader", "PacketWriter", "Tick"]
+__all__ = ["EVENT_SCHEMAS", "MAX_PIXELS", "Label", "Packet", "PacketReader", "PacketWriter", "Tick"]
 
 EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
 """Messages that carry events."""
@@ -23,6 +23,8 @@ EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
 _MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
+MAX_PIXELS = 1 << 22
+"""Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,9 @@ from streamfeat.foreign.words import Source, checked_resolution, declared_resolu
 
 __all__ = ["aedat4_resolution", "hdf5_resolution", "read_aedat4", "read_hdf5"]
 
-_HDF5_ROWS = 1_000_000
+_HDF5_BLOCK_BYTES = 16 << 20
+_HDF5_CHUNK_BYTES = 64 << 20  # a chunk is unpacked whole; Prophesee writes 16,384 events in each
+_HDF5_SQUEEZE = 2048  # rows may take so many times their bytes in the file: deflate saves at most 1032
 
 
 def aedat4_resolution(path: Path) -> Resolution:
@@ -83,8 +85,9 @@ def read_hdf5(file: Source) -> Iterator[Events]:
     try:
         with _library("h5py", file.path).File(file.path, "r") as root:
             dataset = _hdf5_dataset(file.path, root)
-            for row in range(0, len(dataset), _HDF5_ROWS):
-                rows = dataset[row : row + _HDF5_ROWS]
+            step = max(1, _HDF5_BLOCK_BYTES // max(dataset.dtype.itemsize, 1))
+            for row in range(0, len(dataset), step):
+                rows = dataset[row : row + step]
                 yield checked_events(
                     file.path, row, named_columns(file.path, {n: rows[n] for n in rows.dtype.names})
                 )
@@ -97,11 +100,22 @@ def read_hdf5(file: Source) -> Iterator[Events]:
 
 
 def _hdf5_dataset(path: Path, root: Any) -> Any:
-    """`CD/events` of an open file, once it is known that its codec is there."""
+    """`CD/events` of an open file, once it is known that it is in this file, and its codec is there.
+
+    A dataset may say that its bytes are in any other file, and may claim any number of rows that nobody wrote.
+    """
     h5py = _library("h5py", path)
     dataset = root.get("CD/events")
     if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.names is None:
         raise InputError(f"{path}: has no CD/events table, so it is not a Prophesee HDF5 event file")
+    if dataset.external or dataset.is_virtual or dataset.file != root:
+        raise InputError(f"{path}: keeps its events in another file; convert that one")
+    stored = dataset.id.get_storage_size()
+    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
+    if dataset.nbytes > _HDF5_SQUEEZE * stored or chunk_bytes > _HDF5_CHUNK_BYTES:
+        raise InputError(
+            f"{path}: claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}; it is damaged"
+        )
     filters = dataset.id.get_create_plist()
     for code, name in ((f[0], f[3]) for f in map(filters.get_filter, range(filters.get_nfilters()))):
         if not h5py.h5z.filter_avail(code):

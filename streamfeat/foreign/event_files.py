@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.errors import InputError
+from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.foreign.containers import aedat4_resolution, hdf5_resolution, read_aedat4, read_hdf5
 from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
@@ -90,7 +90,7 @@ class EventFile:
     def lose(self, n_bytes: int, why: str) -> None:
         """Note a loss while reading."""
         self.lost_bytes += n_bytes
-        self.damage.append(why)
+        self.damage.append(printable(why))
 
 
 @dataclass(frozen=True, slots=True)

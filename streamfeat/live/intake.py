@@ -26,14 +26,12 @@ from streamfeat.live.delivery import Delivery, DeliveryStats
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.names import Attachment
 from streamfeat.messages import EventPacket, LabelMessage
-from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader, Tick
+from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader, Tick
 
 __all__ = ["MAX_PACKET_EVENTS", "MAX_PAYLOAD_BYTES", "Intake", "TopicState", "Warnings"]
 
 MAX_PAYLOAD_BYTES = 4 << 20
 MAX_PACKET_EVENTS = 1 << 20
-MAX_PIXELS = 1 << 22
-"""The largest event sensors have 2^20."""
 MAX_TOPICS = 256
 _MAX_SPAN_US = 60_000_000
 _MAX_LABEL_US = 3_600_000_000

@@ -19,7 +19,6 @@ import numpy as np
 from streamfeat.classifier import Classifier
 from streamfeat.encoder import Encoder
 from streamfeat.engine import Engine
-from streamfeat.errors import InputError
 from streamfeat.events import Events
 from streamfeat.foreign.datasets import convert
 from streamfeat.foreign.event_files import open_events
@@ -88,7 +87,7 @@ def _read_recording(data: bytes) -> bytes:
         samples = sum(len(sample.events) for sample in recording.samples())
         counts = sorted(recording.losses.counts.items())
         for line in recording.losses.first.values():
-            check_line(InputError(line))
+            check_line(line)
         return seen + repr((samples, labels, counts, recording.topics)).encode()
 
 
@@ -191,7 +190,7 @@ def _read_foreign(name: str, data: bytes) -> bytes:
             assert batch["y"].max() < file.resolution[0]
             assert batch["x"].max() < file.resolution[1]
     for line in file.damage:
-        check_line(InputError(line))
+        check_line(line)
     if zlib.crc32(data) % _CONVERTED == 0:
         done = convert(path, _folder() / "converted.mcap", overwrite=True)
         seen += repr(done.events).encode()

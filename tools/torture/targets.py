@@ -117,8 +117,8 @@ def check_events(events: Events) -> bytes:
     return struct.pack("<2Iq", zlib.crc32(events.tobytes()), zlib.crc32(features), engine.n_events - before)
 
 
-def check_line(error: InputError) -> None:
-    """A refusal is one line that a terminal can show."""
+def check_line(error: InputError | str) -> None:
+    """What is said is one line that a terminal can show."""
     text = str(error)
     assert text.isprintable(), f"not one printable line: {text[:200]!r}"
     assert 0 < len(text) <= _LONGEST_LINE, f"a line of {len(text)} characters"
