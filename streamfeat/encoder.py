@@ -273,7 +273,9 @@ def _check_parameters(
     if not 0 <= threshold <= _LARGEST or (formulation == "inverse" and threshold == 0):
         raise InputError(f"threshold is {threshold}, it must be above zero and at most {_LARGEST:g}")
     if formulation == "inverse" and filters.ndim == 2 and len(filters) > _MOST_ATOMS:
-        raise InputError(f"{len(filters)} atoms are too many, their products are kept for at most {_MOST_ATOMS}")
+        raise InputError(
+            f"{len(filters)} atoms are too many, their products are kept for at most {_MOST_ATOMS}"
+        )
     if filters.ndim != 2 or filters.shape[0] < 1 or filters.shape[1] != d:
         raise InputError(f"filters have shape {filters.shape}, expected (K, {d})")
     for name, array, shape in (("whitening", whitening, (d, d)), ("mean", mean, (d,))):

@@ -1,11 +1,7 @@
-"""Containers that a library opens: AEDAT 4 by faery, Prophesee HDF5 by h5py.
+"""Containers that a library opens: Prophesee HDF5 by h5py.
 
-Lives here: the two libraries, imported when a file needs them, and what they do with damage.
-Not here: the words inside; both libraries hand out columns.
-
-faery yields the packets before a damaged one. dv-processing 2.0.4 refuses a file that was cut
-short and can hang on a flipped bit; eventcv 1.0.8 says nothing of what a damaged file
-lost, and holds the whole file in memory at 32 bytes an event. All three are quicker than packets are written.
+Lives here: the library, imported when a file needs it, and what it does with damage.
+Not here: the words inside; the library hands out columns.
 """
 
 import importlib
@@ -14,55 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution, make_events
+from streamfeat.events import Events, Resolution
 from streamfeat.foreign.tables import checked_events, named_columns, one_line
-from streamfeat.foreign.words import Source, checked_resolution, declared_resolution
+from streamfeat.foreign.words import Source, declared_resolution
 
-__all__ = ["aedat4_resolution", "hdf5_resolution", "read_aedat4", "read_hdf5"]
+__all__ = ["hdf5_resolution", "read_hdf5"]
 
 _HDF5_BLOCK_BYTES = 16 << 20
 _HDF5_CHUNK_BYTES = 64 << 20  # a chunk is unpacked whole; Prophesee writes 16,384 events in each
 _HDF5_SQUEEZE = 2048  # rows may take so many times their bytes in the file: deflate saves at most 1032
-
-
-def aedat4_resolution(path: Path) -> Resolution:
-    """`(height, width)` of the one event stream."""
-    try:
-        tracks = _library("faery", path).aedat.Decoder(path).tracks()
-    except BaseException as error:
-        if not _is_damage(error):
-            raise
-        raise InputError(
-            f"{path}: AEDAT4 header or index is cut short or damaged: {one_line(error)}"
-        ) from error
-    sizes = [track.dimensions for track in tracks if track.data_type == "events"]
-    if len(sizes) != 1:
-        raise InputError(f"{path}: has {len(sizes)} event streams; only files with one are read")
-    return checked_resolution(path, sizes[0][1], sizes[0][0])
-
-
-def read_aedat4(file: Source) -> Iterator[Events]:
-    """Packets of the first event stream; where one is damaged, those before it are kept."""
-    n = 0
-    try:
-        for track, packet in _library("faery", file.path).aedat.Decoder(file.path):
-            if track.data_type == "events":
-                n += len(packet)
-                yield make_events(packet["x"], packet["y"], packet["on"], packet["t"])
-    except BaseException as error:
-        if not _is_damage(error):
-            raise
-        if n == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {one_line(error)}") from error
-        file.lose(0, f"everything after event {n} is lost: {one_line(error)}")
-
-
-def _is_damage(error: BaseException) -> bool:
-    """Whether faery means the file: a RuntimeError, or a panic of its parser.
-
-    A panic is a `PanicException`, which is no `Exception` and belongs to no module that can be imported.
-    """
-    return isinstance(error, RuntimeError) or type(error).__name__ == "PanicException"
 
 
 def hdf5_resolution(path: Path) -> Resolution | None:
@@ -105,17 +61,12 @@ def _hdf5_dataset(path: Path, root: Any) -> Any:
     A dataset may say that its bytes are in any other file, and may claim any number of rows that nobody wrote.
     """
     h5py = _library("h5py", path)
-    dataset = root.get("CD/events")
+    linked = any(isinstance(root.get(name, getlink=True), h5py.ExternalLink) for name in ("CD", "CD/events"))
+    dataset = None if linked else root.get("CD/events")
     if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.names is None:
         raise InputError(f"{path}: has no CD/events table, so it is not a Prophesee HDF5 event file")
-    if dataset.external or dataset.is_virtual or dataset.file != root:
+    if dataset.external or dataset.is_virtual or dataset.file.filename != root.filename:
         raise InputError(f"{path}: keeps its events in another file; convert that one")
-    stored = dataset.id.get_storage_size()
-    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
-    if dataset.nbytes > _HDF5_SQUEEZE * stored or chunk_bytes > _HDF5_CHUNK_BYTES:
-        raise InputError(
-            f"{path}: claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}; it is damaged"
-        )
     filters = dataset.id.get_create_plist()
     for code, name in ((f[0], f[3]) for f in map(filters.get_filter, range(filters.get_nfilters()))):
         if not h5py.h5z.filter_avail(code):
@@ -124,6 +75,12 @@ def _hdf5_dataset(path: Path, root: Any) -> Any:
                 "which is not installed; for ECF (36559) build github.com/prophesee-ai/hdf5_ecf and set "
                 "HDF5_PLUGIN_PATH"
             )
+    stored = dataset.id.get_storage_size()
+    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
+    if dataset.nbytes > _HDF5_SQUEEZE * stored or chunk_bytes > _HDF5_CHUNK_BYTES:
+        raise InputError(
+            f"{path}: claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}; it is damaged"
+        )
     return dataset
 
 

@@ -19,11 +19,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
+from tools.torture.damage import damaged_recordings  # noqa: E402
 from tools.torture.fuzz import hostile_bytes  # noqa: E402
 from tools.torture.table import Part, Row, Trials, markdown  # noqa: E402
 
 PARTS: dict[str, tuple[Part, str]] = {
     "bytes": (hostile_bytes, "every decoder, fed with hostile bytes"),
+    "damage": (damaged_recordings, "recordings cut short, or with bits flipped"),
 }
 
 

@@ -72,7 +72,12 @@ def _recording_seeds() -> list[bytes]:
             out.write_message("/events", EventArray, array, 700_000_000, 9)
             out.write_message("/label", LabelMessage, b"no label", 700_000_000, 9)
 
-    kinds = [("mono", "none", 1), ("evt3", "none", 1 << 20), ("libcaer_cmp", "lz4", 1), ("libcaer", "zstd", 99)]
+    kinds = [
+        ("mono", "none", 1),
+        ("evt3", "none", 1 << 20),
+        ("libcaer_cmp", "lz4", 1),
+        ("libcaer", "zstd", 99),
+    ]
     return [_written(functools.partial(_call, write, kind)) for kind in kinds]
 
 
@@ -224,7 +229,11 @@ def _evt2_seeds() -> list[bytes]:
         for word in (8 << 28 | t >> 6, p << 28 | (t & 63) << 22 | x << 11 | y)
     ]
     body = np.array(words, "<u4").tobytes()
-    heads = (b"% evt 2.0\n", b"% format EVT2;width=640;height=480\n% end\n", b"% evt 2.0\n% geometry 640x480\n")
+    heads = (
+        b"% evt 2.0\n",
+        b"% format EVT2;width=640;height=480\n% end\n",
+        b"% evt 2.0\n% geometry 640x480\n",
+    )
     return [head + body for head in heads]
 
 
@@ -232,7 +241,15 @@ def _evt3_seeds() -> list[bytes]:
     words = [
         word
         for x, y, p, t in _words(some_events())
-        for word in (0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x, 0x3000 | x, 0x4F0F, 0x50F0)
+        for word in (
+            0x8000 | t >> 12,
+            0x6000 | t & 0xFFF,
+            y,
+            0x2000 | p << 11 | x,
+            0x3000 | x,
+            0x4F0F,
+            0x50F0,
+        )
     ]
     body = np.array(words, "<u2").tobytes()
     heads = (b"% evt 3.0\n% end\n", b"% format EVT3;height=480;width=640\n", b"% evt 3.0\n% geometry 64x48\n")
@@ -305,13 +322,45 @@ def _aedat4_seeds() -> list[bytes]:
 
 _HEAD_WORDS = (b"% ", b"\n", b"% end\n", b"geometry ", b"640x480", b"width=", b"height=", b"%", b"evt 3.0")
 _CAMERA_WORDS = (*_HEAD_WORDS, b"99999", b"0x0", b"format EVT3;", b"% Width 99999999\n", b"\x00\x08")
-_ROW_WORDS = (b"1e999", b"nan", b"inf", b"-1", b"1e308", b",", b" ", b"\n", b"\r", b"#", b"0x1p3", b"1_0", b"t")
-_NUMPY_WORDS = (b"<f8", b"|O8", b">i8", b"|b1", b"<f2", b"<c16", b"<M8[s]", b"(", b"()", b"99999999999", b"|S0")
+_ROW_WORDS = (
+    b"1e999",
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e308",
+    b",",
+    b" ",
+    b"\n",
+    b"\r",
+    b"#",
+    b"0x1p3",
+    b"1_0",
+    b"t",
+)
+_NUMPY_WORDS = (
+    b"<f8",
+    b"|O8",
+    b">i8",
+    b"|b1",
+    b"<f2",
+    b"<c16",
+    b"<M8[s]",
+    b"(",
+    b"()",
+    b"99999999999",
+    b"|S0",
+)
 _EVENT_LINES = (*_ROW_WORDS, b"0.1 1 2 1\n", b"x", b"99999999999999999999", b"\x0b", b"\x1c")
 
 FILE_TARGETS = [
     Target(
-        "recording", _recording_seeds, _read_recording, 5_000, mend_mcap, most=16_384, memory=640 << 20,
+        "recording",
+        _recording_seeds,
+        _read_recording,
+        5_000,
+        mend_mcap,
+        most=16_384,
+        memory=640 << 20,
         kernels=True,
     ),
     Target("recover", _recording_seeds, _recover_recording, 2_500, mend_mcap, most=16_384, memory=640 << 20),

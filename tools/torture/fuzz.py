@@ -4,8 +4,8 @@
     python tools/torture --only bytes --scale 10   # ten million
 
 Each target runs in a process of its own, which may die: what it was fed last is in a file. Where atheris is
-installed (`pip install 'streamfeat[fuzz]'`), a tenth of the inputs is guided by which branches of streamfeat
-they reach, and the others are changes of what that found; where it is not, they are changes of the seeds.
+installed (`pip install 'streamfeat[fuzz]'`), a tenth of the inputs, at most 20,000, is guided by which branches of
+streamfeat they reach, and the others are changes of what that found; where it is not, they are changes of the seeds.
 Rows say how many were guided. Targets that end in
 kernels run again with bounds checked, and again with nothing compiled, and must give the same as ever.
 
@@ -48,7 +48,7 @@ _HARD_SECONDS = 60.0
 _ROOM_BYTES = 4 << 30  # of address space, so that a large claim fails instead of being granted
 _SAY_EVERY_S = 30.0
 _RESTARTS = 20
-_GUIDED_SHARE = 0.1  # of the executions; the others change what those have found, three times as fast
+_GUIDED_SHARE, _MOST_GUIDED = 0.1, 20_000  # the others change what those have found, three times as fast
 _CHECKED = 1_000  # inputs of a target, again with bounds checks, and again without compiling
 
 _MODES: dict[str, dict[str, str]] = {
@@ -106,7 +106,7 @@ def _row(name: str, mode: str, runs: int, guided: bool, folder: Path, trials: Tr
     environment = os.environ | _MODES[mode] | {"TMPDIR": shared, "PYTHONPATH": str(ROOT)}
     if mode:
         environment["NUMBA_CACHE_DIR"] = str(folder.parent / f"numba_{mode.split()[0]}")
-    led = round(runs * _GUIDED_SHARE) if guided else 0
+    led = min(round(runs * _GUIDED_SHARE), _MOST_GUIDED) if guided else 0
     for restart in range(_RESTARTS):
         how = "guided" if status["done"] < led else "random"
         left = (led or runs) - status["done"] if how == "guided" else runs - status["done"]
@@ -134,7 +134,11 @@ def _row(name: str, mode: str, runs: int, guided: bool, folder: Path, trials: Tr
     tried = status["done"] + len(died)
     seconds = time.monotonic() - started
     return Row(
-        f"bytes: {name}", tried, status["done"] - status["failed"], seconds=seconds, note=note,
+        f"bytes: {name}",
+        tried,
+        status["done"] - status["failed"],
+        seconds=seconds,
+        note=note,
         failures=tuple(failures),
     )
 
@@ -308,7 +312,9 @@ def _let_kernels_read_events() -> None:
     from streamfeat.events import EVENT_DTYPE
 
     def reading(kernel: Callable[..., Any], *arguments: Any) -> Any:
-        return kernel(*(a.view(np.recarray) if getattr(a, "dtype", 0) == EVENT_DTYPE else a for a in arguments))
+        return kernel(
+            *(a.view(np.recarray) if getattr(a, "dtype", 0) == EVENT_DTYPE else a for a in arguments)
+        )
 
     for module, names in ((codecs, ("decode_evt3", "decode_libcaer_cmp")), (engine, ("count_events",))):
         for name in names:
