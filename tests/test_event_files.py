@@ -1,6 +1,6 @@
 """Foreign files: real recordings against known facts, and small files written here, whole and damaged."""
 
-import importlib
+import os
 import struct
 from pathlib import Path
 
@@ -368,10 +368,8 @@ def test_aedat4_of_another_writer(tmp_path, compression):
 
 
 def test_a_missing_library_names_the_extra(tmp_path, monkeypatch):
-    def without_h5py(name: str, *rest: object) -> object:
-        raise ImportError(name)
-
-    monkeypatch.setattr(importlib, "import_module", without_h5py)
+    (tmp_path / "h5py.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     path = file_of(tmp_path, "a.h5", b"\x89HDF\r\n\x1a\n")
     with pytest.raises(InputError, match=r"needs h5py: pip install 'streamfeat\[convert\]'"):
         open_events(path)

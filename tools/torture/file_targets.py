@@ -7,6 +7,7 @@ import atexit
 import functools
 import io
 import shutil
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -14,7 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
+import zstandard
 
 from streamfeat.classifier import Classifier
 from streamfeat.encoder import Encoder
@@ -308,18 +311,36 @@ def _hdf5_seeds() -> list[bytes]:
 
 
 def _aedat4_seeds() -> list[bytes]:
-    import faery
-
-    def write(path: Path, n: int) -> None:
-        events = some_events(n)
-        theirs = np.zeros(n, faery.EVENTS_DTYPE)
-        for mine, field in zip("txyp", ("t", "x", "y", "on"), strict=True):
-            theirs[field] = events[mine]
-        faery.events_stream_from_array(theirs, (16, 12)).to_file(path)
-
-    return [_written(functools.partial(_call, write, (n,)), "seed.aedat4") for n in (5, 60)]
+    return [_aedat4(0, 4), _aedat4(0, 30), _aedat4(1, 30), _aedat4(3, 30)]
 
 
+def _aedat4(compression: int, n: int) -> bytes:
+    """A file of two packets of events and one of triggers, as DV lays them out, without an index."""
+    pack: Callable[[bytes], bytes] = bytes
+    if compression:
+        pack = lz4.frame.compress if compression == 1 else zstandard.ZstdCompressor().compress
+    streams = "".join(
+        f"<node name='{number}'><attr key='typeIdentifier'>{kind}</attr><node name='info'>"
+        "<attr key='sizeX'>16</attr><attr key='sizeY'>12</attr></node></node>"
+        for number, kind in enumerate(("EVTS", "TRIG"))
+    )
+    description = f"<dv version='2.0'><node name='outInfo'>{streams}</node></dv>".encode()
+    # A table: where its fields are, then the fields themselves, then what they point to.
+    fields = struct.pack("<5H2x", 10, 20, 4, 8, 16)
+    table = struct.pack("<iiqI", len(fields), compression, -1, 4) + struct.pack("<I", len(description))
+    header = struct.pack("<I4s", 8 + len(fields), b"IOHE") + fields + table + description
+    parts = [b"#!AER-DAT4.0\r\n", struct.pack("<I", len(header)), header]
+    rows = np.zeros(n, "<i8,<i2,<i2,<u4")
+    for column, field in zip(rows.dtype.names or (), "txyp", strict=True):
+        rows[column] = some_events(n)[field]
+    for kind, stream in ((b"EVTS", 0), (b"TRIG", 1), (b"EVTS", 0)):
+        body = struct.pack("<I4s3H2xiII", 16, kind, 6, 8, 4, 8, 4, n) + rows.tobytes()
+        packed = pack(struct.pack("<I", len(body)) + body)
+        parts += [struct.pack("<2i", stream, len(packed)), packed]
+    return b"".join(parts)
+
+
+_XML_WORDS = (b"<node name='0'>", b"<attr key='sizeX'>", b"</node>", b"99999", b"<!DOCTYPE a>", b"EVTS")
 _HEAD_WORDS = (b"% ", b"\n", b"% end\n", b"geometry ", b"640x480", b"width=", b"height=", b"%", b"evt 3.0")
 _CAMERA_WORDS = (*_HEAD_WORDS, b"99999", b"0x0", b"format EVT3;", b"% Width 99999999\n", b"\x00\x08")
 _ROW_WORDS = (
@@ -384,8 +405,8 @@ FILE_TARGETS = [
             ("EVT3", "raw", _evt3_seeds, 6_000, bytes, _CAMERA_WORDS),
             ("text", "txt", _text_seeds, 6_000, bytes, _EVENT_LINES),
             ("NumPy", "npz", _numpy_seeds, 4_000, mend_zip, _NUMPY_WORDS),
-            ("HDF5", "h5", _hdf5_seeds, 1_500, bytes, ()),
-            ("AEDAT4", "aedat4", _aedat4_seeds, 3_000, bytes, ()),
+            ("HDF5", "h5", _hdf5_seeds, 60, bytes, ()),
+            ("AEDAT4", "aedat4", _aedat4_seeds, 6_000, bytes, _XML_WORDS),
         )
     ),
 ]

@@ -24,19 +24,24 @@ def mutate(
 ) -> bytes:
     """Change `data` in one to six places, as `rng` says; at most `most` bytes come out."""
     out = bytearray(data)
-    for _ in range(1 + rng.randrange(_MOST_CHANGES)):
-        rng.choice(_CHANGES)(out, seeds, words, rng)
+    for _ in range(1 + _below(rng, _MOST_CHANGES)):
+        _CHANGES[_below(rng, len(_CHANGES))](out, seeds, words, rng)
     return bytes(out[:most])
+
+
+def _below(rng: random.Random, n: int) -> int:
+    """As `rng.randrange(n)`, in a fifth of the time."""
+    return int(rng.random() * n)
 
 
 def _flip(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
+        out[_below(rng, len(out))] ^= 1 << _below(rng, 8)
 
 
 def _byte(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        out[rng.randrange(len(out))] = rng.randrange(256)
+        out[_below(rng, len(out))] = _below(rng, 256)
 
 
 def _number(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
@@ -44,58 +49,58 @@ def _number(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng:
     size = rng.choice((2, 4, 8))
     if len(out) < size:
         return
-    value = rng.choice((*_NUMBERS, *_LARGE, len(out), len(out) + 1, rng.randrange(1 << 16)))
-    at = rng.randrange(len(out) - size + 1)
+    value = rng.choice((*_NUMBERS, *_LARGE, len(out), len(out) + 1, _below(rng, 1 << 16)))
+    at = _below(rng, len(out) - size + 1)
     out[at : at + size] = (value & ((1 << 8 * size) - 1)).to_bytes(size, "little")
 
 
 def _step(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     """A byte a little larger or smaller."""
     if out:
-        at = rng.randrange(len(out))
-        out[at] = (out[at] + rng.randrange(-4, 5)) & 0xFF
+        at = _below(rng, len(out))
+        out[at] = (out[at] + _below(rng, 9) - 4) & 0xFF
 
 
 def _truncate(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        del out[rng.randrange(len(out)) :]
+        del out[_below(rng, len(out)) :]
 
 
 def _delete(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        at = rng.randrange(len(out))
-        del out[at : at + 1 + rng.randrange(16)]
+        at = _below(rng, len(out))
+        del out[at : at + 1 + _below(rng, 16)]
 
 
 def _insert(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
-    at = rng.randrange(len(out) + 1)
-    out[at:at] = rng.randbytes(1 + rng.randrange(16))
+    at = _below(rng, len(out) + 1)
+    out[at:at] = rng.randbytes(1 + _below(rng, 16))
 
 
 def _repeat(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        at = rng.randrange(len(out))
-        out[at:at] = bytes(out[at : at + 1 + rng.randrange(64)]) * (1 + rng.randrange(4))
+        at = _below(rng, len(out))
+        out[at:at] = bytes(out[at : at + 1 + _below(rng, 64)]) * (1 + _below(rng, 4))
 
 
 def _move(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     if out:
-        source, target, n = rng.randrange(len(out)), rng.randrange(len(out)), 1 + rng.randrange(32)
+        source, target, n = _below(rng, len(out)), _below(rng, len(out)), 1 + _below(rng, 32)
         out[target : target + n] = out[source : source + n]
 
 
 def _splice(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     """The rest of another seed from here on."""
-    other = rng.choice(seeds)
+    other = seeds[_below(rng, len(seeds))]
     if out and other:
-        out[rng.randrange(len(out)) :] = other[rng.randrange(len(other)) :]
+        out[_below(rng, len(out)) :] = other[_below(rng, len(other)) :]
 
 
 def _word(out: bytearray, seeds: Sequence[bytes], words: Sequence[bytes], rng: random.Random) -> None:
     """One of the words of the format, written over what is there or put in between."""
     if words:
-        word, at = rng.choice(words), rng.randrange(len(out) + 1)
-        out[at : at + len(word) * rng.randrange(2)] = word
+        word, at = words[_below(rng, len(words))], _below(rng, len(out) + 1)
+        out[at : at + len(word) * _below(rng, 2)] = word
 
 
 _Change = Callable[[bytearray, Sequence[bytes], Sequence[bytes], random.Random], None]
