@@ -205,8 +205,8 @@ class Recording:
             else:
                 yield item
         for channel_id, channel in self._known.channels.items() if self._has_summary else ():
-            schema = self._known.schemas.get(channel.schema_id)
-            if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
+            kind = self._known.schemas.get(channel.schema_id)
+            if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
                 count_missing(self._known, channel_id, seen[channel_id], losses)
 
     def played(

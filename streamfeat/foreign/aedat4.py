@@ -8,8 +8,8 @@ index is, and an XML description of the streams; then packets, each with its str
 FlatBuffers table of events that is compressed by itself. The index is not needed to read from front to back,
 so a file without one, or with one that is damaged, is read like any other.
 
-Every offset is compared with the bytes that are there. Decoders by others do not: on a few changed bytes faery
-0.7.1 ends the process, dv-processing 2.0.4 can hang, and eventcv 1.0.8 says nothing of what is lost.
+Every offset is compared with the bytes that are there. Decoders by others do not: on a few changed bytes
+faery 0.7.1 ends the process, dv-processing 2.0.4 can hang, and eventcv 1.0.8 says nothing of what is lost.
 """
 
 import struct
@@ -33,10 +33,7 @@ _MAGIC = b"#!AER-DAT4.0\r\n"
 _LARGEST_HEADER = 1 << 20
 _LARGEST_PACKET = 64 << 20  # bytes when unpacked, 2^22 events; DV writes some thousand
 _UNPACK = {0: "", 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
-_EVENT = np.dtype(
-    {"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "u1"], "offsets": [0, 8, 10, 12]}
-    | {"itemsize": 16}
-)
+_EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1"), ("", "V3")])
 _DAMAGE = (ValueError, RuntimeError, EOFError, MemoryError, zstandard.ZstdError)
 
 
@@ -208,4 +205,4 @@ def _events(data: bytes) -> Events:
     rows = np.frombuffer(table.vector(0, _EVENT.itemsize), _EVENT)
     if (rows["t"] < 0).any():
         raise ValueError("an event before time 0")
-    return make_events(rows["x"].view(np.uint16), rows["y"].view(np.uint16), rows["on"] != 0, rows["t"])
+    return make_events(rows["x"], rows["y"], rows["on"] != 0, rows["t"])

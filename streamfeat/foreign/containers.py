@@ -9,8 +9,10 @@ import sys
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
@@ -39,7 +41,7 @@ def hdf5_resolution(path: Path) -> Resolution | None:
 def read_hdf5(file: Source) -> Iterator[Events]:
     """Rows of `CD/events`; where a chunk is damaged, those before it are kept."""
     n = 0
-    columns = {}
+    columns: dict[str, NDArray[Any]] = {}
     try:
         for kind, data in _frames(file.path):
             if kind == b"b":

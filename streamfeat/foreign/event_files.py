@@ -1,8 +1,8 @@
 """One foreign event file -> batches of events.
 
 Lives here: which format a file has, its resolution where it says so, and its events, read lazily in batches.
-Not here: the formats themselves (`words`, `aedat4`, `containers`, `tables`), folders and labels (`datasets`), and
-MCAP (`streamfeat.recording`).
+Not here: the formats themselves (`words`, `aedat4`, `containers`, `tables`), folders and labels (`datasets`),
+and MCAP (`streamfeat.recording`).
 """
 
 from collections.abc import Callable, Iterator

@@ -3,8 +3,8 @@
 Lives here: h5py, what it is asked for, and the limits on it. Imports nothing heavy: each file waits for it.
 Not here: what rows mean, and what becomes of a process that does not end in order (`containers`).
 
-The HDF5 library trusts what it reads: a few changed bytes make it loop without end, and others have made it
-read where nothing is. Nothing of that can be mended from outside, so it happens here, where it costs a process.
+The HDF5 library trusts what it reads: a few changed bytes make it loop without end. Nothing of that can be
+mended from outside, so it happens here, where it costs a process.
 
 What is written is a row of frames, each a kind (one byte), a length (int64) and so many bytes: the geometry
 (`g`); for each block of rows its columns (`x`, `y`, `p`, `t`, each as `.npy`) and an end (`b`); last, one of
@@ -84,7 +84,7 @@ def _say_rows(out: BinaryIO, rows: Any) -> None:
 def _dataset(h5py: Any, root: Any) -> Any:
     """`CD/events` of an open file, once it is known that it is in this file, and its codec is there.
 
-    A dataset may say that its bytes are in any other file, and may claim any number of rows that nobody wrote.
+    A dataset may say that its bytes are in any other file, and claim any number of rows that nobody wrote.
     """
     linked = any(isinstance(root.get(name, getlink=True), h5py.ExternalLink) for name in ("CD", "CD/events"))
     dataset = None if linked else root.get("CD/events")
@@ -102,7 +102,7 @@ def _dataset(h5py: Any, root: Any) -> Any:
     stored = dataset.id.get_storage_size()
     chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
     if dataset.nbytes > _SQUEEZE * stored or chunk_bytes > _CHUNK_BYTES:
-        raise InputError(f"claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}: damaged")
+        raise InputError(f"claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}")
     return dataset
 
 

@@ -274,7 +274,7 @@ def try_damage(specimen: Specimen, data: bytes, folder: Path, tally: _Tally | No
             items = list(recording.items())
             losses = recording.losses
     except InputError as error:
-        assert not packets_left, f"refused, though packets are left: {error}"
+        _promise(not packets_left, f"refused, though packets are left: {error}")
         tally.lost_events += sum(specimen.n_events)
         tally.lost_bytes += len(data)
         return
@@ -285,6 +285,11 @@ def try_damage(specimen: Specimen, data: bytes, folder: Path, tally: _Tally | No
     tally.lost_bytes += sum(losses.bytes.values())
     assert len(items) == len(specimen.keys) or losses, "a loss that is not reported"
     _check_features(specimen, path, whole, losses)
+
+
+def _promise(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise AssertionError(otherwise)
 
 
 def _untouched(specimen: Specimen, data: bytes) -> list[int]:
@@ -305,7 +310,7 @@ def _recovered(
     try:
         losses = recover(path, target, overwrite=True)
     except InputError as error:
-        assert not whole, f"not recovered: {error}"
+        _promise(not whole, f"not recovered: {error}")
         return []
     tally.recovery_s.append(time.perf_counter() - started)
     with target.open("rb") as file:

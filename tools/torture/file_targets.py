@@ -29,8 +29,8 @@ from streamfeat.geometry import Geometry
 from streamfeat.messages import EventArray, LabelMessage
 from streamfeat.recorder import RecordingWriter, recover
 from streamfeat.recording import Label, Packet, open_recording
-from tools.torture.mutate import mend_mcap, mend_zip
-from tools.torture.targets import Target, check_events, check_line, some_events, tiny_encoder
+from tools.torture.mutate import mend_mcap, mend_tensors, mend_zip
+from tools.torture.targets import Target, check_events, check_line, some_events
 
 __all__ = ["FILE_TARGETS"]
 
@@ -385,8 +385,17 @@ FILE_TARGETS = [
         kernels=True,
     ),
     Target("recover", _recording_seeds, _recover_recording, 2_500, mend_mcap, most=16_384, memory=640 << 20),
-    Target("model", _model_seeds, _load_model, 8_000, words=_TENSOR_WORDS, memory=192 << 20, kernels=True),
-    Target("classifier", _classifier_seeds, _load_classifier, 10_000, words=_TENSOR_WORDS),
+    Target(
+        "model",
+        _model_seeds,
+        _load_model,
+        8_000,
+        mend_tensors,
+        words=_TENSOR_WORDS,
+        memory=192 << 20,
+        kernels=True,
+    ),
+    Target("classifier", _classifier_seeds, _load_classifier, 10_000, mend_tensors, words=_TENSOR_WORDS),
     *(
         Target(
             f"camera file {name}",
@@ -405,7 +414,7 @@ FILE_TARGETS = [
             ("EVT3", "raw", _evt3_seeds, 6_000, bytes, _CAMERA_WORDS),
             ("text", "txt", _text_seeds, 6_000, bytes, _EVENT_LINES),
             ("NumPy", "npz", _numpy_seeds, 4_000, mend_zip, _NUMPY_WORDS),
-            ("HDF5", "h5", _hdf5_seeds, 60, bytes, ()),
+            ("HDF5", "h5", _hdf5_seeds, 12, bytes, ()),
             ("AEDAT4", "aedat4", _aedat4_seeds, 6_000, bytes, _XML_WORDS),
         )
     ),
