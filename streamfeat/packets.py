@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from streamfeat.codecs import MAX_PACKET_EVENTS, Decoder, encode, make_decoder
+from streamfeat.codecs import EVT3_WRAP_US, MAX_PACKET_EVENTS, Decoder, Evt3Decoder, encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
@@ -22,6 +22,7 @@ EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
 
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
+_MOST_WRAPS = 86_400_000_000 // EVT3_WRAP_US  # in a day
 _MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
 MAX_PIXELS = 1 << 22
 """Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
@@ -100,6 +101,8 @@ class PacketReader:
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
+        self._is_broken = False
+        self._before: tuple[int, int] | None = None
 
     def read(self, schema: str, data: bytes | memoryview, log_time_ns: int, sequence: int) -> Packet:
         """Read one message; `sequence` stands in where the message has no number of its own.
@@ -121,15 +124,37 @@ class PacketReader:
         resolution = _resolution(packet.height, packet.width)
         if packet.encoding not in self._decoders:
             self._decoders[packet.encoding] = make_decoder(packet.encoding, self._max_events)
-        events = self._decoders[packet.encoding].decode(packet.events, packet.time_base)
+        decoder = self._decoders[packet.encoding]
+        events = decoder.decode(packet.events, packet.time_base)
+        if isinstance(decoder, Evt3Decoder) and len(events):
+            self._place(decoder, events, packet.stamp_ns)
         self.encoding = packet.encoding
         # The times of evt3 are the camera's own; its time_base is on another clock.
         timed = packet.time_base and packet.encoding != "evt3"
         self.time_us = packet.time_base // 1000 if timed else None
         return Packet(self._topic, events, resolution, log_time_ns, packet.seq)
 
+    def _place(self, decoder: Evt3Decoder, events: Events, stamp_ns: int) -> None:
+        """After missing packets, count the wraps of 16.8 s that they would have shown, by the stamps around.
+
+        Args:
+            decoder: of the packet, changed.
+            events: of the packet, at least one, changed.
+            stamp_ns: of the packet.
+        """
+        if self._is_broken and self._before:
+            stamp_before_ns, last_us = self._before
+            expected_us = last_us + (stamp_ns - stamp_before_ns) // 1000
+            wraps = round((expected_us - int(events["t"][0])) / EVT3_WRAP_US)
+            if 0 < wraps <= _MOST_WRAPS:
+                decoder.count_wraps(wraps)
+                events["t"] += wraps * EVT3_WRAP_US
+        self._is_broken = False
+        self._before = stamp_ns, int(events["t"][-1])
+
     def resync(self) -> None:
         """Messages are missing: what came before says nothing about what follows."""
+        self._is_broken = True
         for decoder in self._decoders.values():
             decoder.resync()
 

@@ -19,6 +19,7 @@ from streamfeat.codecs import ENCODINGS, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.packets import PacketWriter
 from streamfeat.recorder import RecordingWriter, recover
 from streamfeat.recording import Label, Packet, Topic, open_recording
 
@@ -192,6 +193,23 @@ def test_lost_packets_do_not_lend_their_state(tmp_path):
     assert read(path)[0].tolist() == [(3, 5, 0, 0)]
     path = write_messages(tmp_path / "a.mcap", packet("evt3", start, seq=0), packet("evt3", lone_x, seq=1))
     assert read(path)[0].tolist() == [(3, 5, 0, 0), (1, 5, 0, 0)]
+
+
+@pytest.mark.parametrize("gaps_s", [(1, 1, 1), (20, 20, 20), (40, 3, 1), (1, 9, 300), (60, 90, 7)])
+def test_lost_evt3_packets_do_not_move_those_that_follow(tmp_path, gaps_s):
+    """Its clock wraps every 16.8 s, and the packets that would have shown it are lost."""
+    parts, start_us = [], 0
+    for i, gap_s in enumerate((0, *gaps_s)):
+        parts.append(random_events(30, 500_000, seed=i))
+        start_us += gap_s * 1_000_000
+        parts[-1]["t"] += start_us
+    writer = PacketWriter("evt3")
+    packets = [m.to_cdr() for part in parts for m in writer.messages(part, RESOLUTION)]
+    assert len(packets) == 4
+    for lost in range(1, 4):
+        kept = [p for i, p in enumerate(packets) if i != lost]
+        events, _ = read(write_messages(tmp_path / "a.mcap", *kept))
+        np.testing.assert_array_equal(events, np.concatenate([p for i, p in enumerate(parts) if i != lost]))
 
 
 # --- writing never harms
