@@ -20,7 +20,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ _SOURCE = ROOT / "recordings/digits_test.mcap"
 _EVENTS_A_PACKET = 250
 _CHUNK_BYTES = 2048
 _EMIT = "100ms"
+_EVT3_SILENCE_US = 19_000_000  # its clock wraps after 17
 _CLI_TIMEOUT_S = 300
 _MESSAGE = 0x05
 _CHUNK = 0x06
@@ -189,14 +190,16 @@ def flipped(data: bytes, at: int, bit: int) -> bytes:
 
 
 def make_specimen(folder: Path, encoding: str, n_samples: int = 8) -> Specimen:
-    """Labelled digits in many small chunks, several to a sample."""
+    """Labelled digits in many small chunks, several to a sample; in evt3, far apart."""
     path = folder / f"{encoding}.mcap"
     with (
         open_recording(_SOURCE) as source,
         RecordingWriter(path, encoding=encoding, compression="lz4", chunk_size=_CHUNK_BYTES) as out,
     ):
-        for _, sample in zip(range(n_samples), source.samples(), strict=False):
-            out.write_label(sample.label)
+        for number, sample in zip(range(n_samples), source.samples(), strict=False):
+            later_us = number * _EVT3_SILENCE_US if encoding == "evt3" else 0
+            out.write_label(replace(sample.label, start_us=sample.label.start_us + later_us))
+            sample.events["t"] += later_us
             for start in range(0, len(sample.events), _EVENTS_A_PACKET):
                 out.write_events(sample.events[start : start + _EVENTS_A_PACKET], sample.resolution)
     data = path.read_bytes()
