@@ -23,7 +23,10 @@ class InputError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Text as one line that does nothing to a terminal: other characters escaped, at most 1000 of them."""
+    """Text as one line that does nothing to a terminal: at most 1000 characters, white space as spaces, what
+    cannot be shown escaped.
+    """
     if not text.isprintable():
-        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[:_LONGEST])
+        spaced = (" " if c.isspace() else c for c in text[:_LONGEST])
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in spaced)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
