@@ -45,8 +45,7 @@ _CHUNK_BYTES = 2048
 _EMIT = "100ms"
 _EVT3_SILENCE_US = 19_000_000  # its clock wraps after 17
 _CLI_TIMEOUT_S = 300
-_MESSAGE = 0x05
-_CHUNK = 0x06
+_VERSION_AT = slice(5, 6)
 _FRAME_BYTES = 9
 _CHUNK_HEAD_BYTES = _FRAME_BYTES + 8 + 8 + 8 + 4 + 4 + 3 + 8  # with `lz4` as the compression
 
@@ -296,7 +295,9 @@ def _promise(holds: bool, otherwise: str) -> None:
 
 
 def _untouched(specimen: Specimen, data: bytes) -> list[int]:
-    """Messages of the chunks that are whole and the same as before."""
+    """Messages of the chunks that are whole and the same as before; none of a file of another version."""
+    if data[_VERSION_AT] != specimen.data[_VERSION_AT]:
+        return []
     return [
         number
         for chunk in specimen.chunks
