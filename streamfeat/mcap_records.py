@@ -304,10 +304,24 @@ def _is_record(opcode: int, length: int, head: bytes) -> bool:
     """Whether a record may start with these bytes; types above 0x80 are private to whoever wrote them."""
     if opcode == Opcode.CHUNK:
         return _chunk_length(head, 0) == length
+    is_index = _is_index(length, head)
+    if opcode == Opcode.MESSAGE_INDEX:
+        return is_index
+    if is_index and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        return False  # nor make a message of what is none
     # A damaged type must not end the file early, nor pass a chunk for something to step over.
     if opcode in _ENDS or _chunk_length(head, 0) == length:
         return False
     return Opcode.HEADER <= opcode < Opcode.DATA_END or opcode >= 0x80
+
+
+def _is_index(length: int, head: bytes) -> bool:
+    """Whether a record has the shape of a message index: a length that agrees, an offset that may be one."""
+    if length < 6 or len(head) < 31:
+        return False
+    (size,) = struct.unpack_from("<I", head, 11)
+    (offset,) = struct.unpack_from("<Q", head, 23) if size else (0,)
+    return bool(length == 6 + size and size % 16 == 0 and offset <= MAX_RECORD_BYTES)
 
 
 def _chunk_length(block: bytes, at: int) -> int | None:

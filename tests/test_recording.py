@@ -399,6 +399,7 @@ def test_damaged_type_costs_one_chunk_at_most(tmp_path, chunked, bit):
         damaged = data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
         found, losses = read_packets(tmp_path / "a.mcap", damaged)
         assert found == packets[:7] + packets[7 + cost :]
+        assert "bad packet" not in losses.counts
         told = recover(tmp_path / "a.mcap", tmp_path / "b.mcap", overwrite=True)
         assert bool(losses) >= cost
         assert bool(told) >= cost
