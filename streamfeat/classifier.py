@@ -169,12 +169,18 @@ class Classifier:
                 raise InputError(f"{path}: {name} is not finite; train it again")
         if n == 0 or not (arrays["scale"] > 0).all():
             raise InputError(f"{path}: scale must be above zero; train it again")
-        return cls(
-            labels=tuple(labels),
-            **{name: arrays[name] for name in shapes},
-            fingerprint=fingerprint,
-            provenance=provenance,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            loaded = cls(
+                labels=tuple(labels),
+                **{name: arrays[name] for name in shapes},
+                fingerprint=fingerprint,
+                provenance=provenance,
+            )
+            # No score can be larger than this: normalised features have unit length.
+            largest = np.abs(loaded._folded).sum(axis=0) + np.abs(loaded._folded_bias)
+        if not np.isfinite(largest).all():
+            raise InputError(f"{path}: scores would not be finite; train it again")
+        return loaded
 
 
 def train_classifier(

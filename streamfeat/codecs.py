@@ -18,7 +18,15 @@ from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
 from streamfeat.kernels.decode import decode_evt3, decode_libcaer_cmp
 
-__all__ = ["ENCODINGS", "MAX_PACKET_EVENTS", "Decoder", "encode", "make_decoder"]
+__all__ = [
+    "ENCODINGS",
+    "EVT3_WRAP_US",
+    "MAX_PACKET_EVENTS",
+    "Decoder",
+    "Evt3Decoder",
+    "encode",
+    "make_decoder",
+]
 
 MAX_PACKET_EVENTS = 1 << 24
 """No payload may hold more events than this (268 MB of them); real packets hold 100 to 100,000."""
@@ -27,6 +35,7 @@ _Words = NDArray[np.uint16]
 
 _LIBCAER = np.dtype([("data", "<u4"), ("us", "<u4")])
 _LIBCAER_WRAP_US = 1 << 31
+EVT3_WRAP_US = 1 << 24
 _EVT3_MAX_STEP = 1 << 11  # of TIME_HIGH: half of its 12 bits, so that no reader takes it for a step back
 _EVT3_MAX_BRIDGE = 1 << 12  # TIME_HIGH words that may cross a silent gap: 9.5 hours
 
@@ -174,6 +183,10 @@ class Evt3Decoder(_Carrying):
     def resync(self) -> None:
         """See `Decoder.resync`: wait for time and address again; the wraps counted so far stay."""
         self._state[-1] = 0
+
+    def count_wraps(self, n: int) -> None:
+        """Time has wrapped so often more than the packets that were decoded could show."""
+        self._state[0] += n << 12
 
 
 _DECODERS: dict[str, Callable[[int], Decoder]] = {

@@ -27,11 +27,12 @@ from streamfeat.simulate import CameraModel, digit_samples
 __all__ = ["EXTRAS", "examine"]
 
 EXTRAS = {
-    "convert": "AEDAT4 and Prophesee HDF5 files",
+    "convert": "Prophesee HDF5 files",
     "export": "Arrow, Parquet and pandas",
     "plot": "pages and pictures of results",
     "view": "Foxglove",
     "bench": "peers in tools/bench",
+    "fuzz": "guided inputs in tools/torture",
     "test": "the tests",
     "lint": "lint and types",
 }

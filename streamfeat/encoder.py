@@ -33,6 +33,7 @@ _KIND = "streamfeat-encoder"
 Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
 
+_MOST_ATOMS = 1 << 12  # their products with each other take 128 MiB while they are made
 _LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
 
 
@@ -271,6 +272,10 @@ def _check_parameters(
         raise InputError(f"encoding is {encoding!r}, it must be one of {', '.join(ENCODINGS)}")
     if not 0 <= threshold <= _LARGEST or (formulation == "inverse" and threshold == 0):
         raise InputError(f"threshold is {threshold}, it must be above zero and at most {_LARGEST:g}")
+    if formulation == "inverse" and filters.ndim == 2 and len(filters) > _MOST_ATOMS:
+        raise InputError(
+            f"{len(filters)} atoms are too many, their products are kept for at most {_MOST_ATOMS}"
+        )
     if filters.ndim != 2 or filters.shape[0] < 1 or filters.shape[1] != d:
         raise InputError(f"filters have shape {filters.shape}, expected (K, {d})")
     for name, array, shape in (("whitening", whitening, (d, d)), ("mean", mean, (d,))):

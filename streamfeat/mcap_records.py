@@ -26,12 +26,13 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
-from streamfeat.errors import InputError
+from streamfeat.errors import InputError, printable
 
 __all__ = [
     "MAX_RECORD_BYTES",
     "Losses",
     "Summary",
+    "count_missing",
     "iter_messages",
     "iter_records",
     "open_mcap",
@@ -39,10 +40,13 @@ __all__ = [
 ]
 
 _MAGIC = b"\x89MCAP0\r\n"
+_VERSION_AT = 5
 MAX_RECORD_BYTES = 1 << 28
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 _SCAN_BYTES = 1 << 16
+_ENDS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
+"""Records after which no message comes, and their lengths."""
 
 # A chunk's header is recognised by its compression name; its two lengths must then agree.
 _CHUNK_HEAD = re.compile(rb"\x06(?=.{36}(?:\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd))", re.DOTALL)
@@ -68,7 +72,8 @@ class Losses:
         """Count one loss."""
         self.counts[reason] += count
         self.bytes[reason] += n_bytes
-        self.first.setdefault(reason, where)
+        if reason not in self.first:
+            self.first[reason] = printable(where)
 
     def __bool__(self) -> bool:
         """Whether anything was lost."""
@@ -96,7 +101,9 @@ def open_mcap(path: Path) -> BinaryIO:
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
     magic = file.read(len(_MAGIC))
-    if magic != _MAGIC:
+    # One byte may be damaged, if it is not the version: what follows has sums of its own.
+    wrong = [at for at, (byte, right) in enumerate(zip(magic, _MAGIC, strict=False)) if byte != right]
+    if len(magic) < len(_MAGIC) or len(wrong) > 1 or _VERSION_AT in wrong:
         file.close()
         what = "is empty" if not magic else "is not an MCAP recording"
         raise InputError(f"{path}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
@@ -146,7 +153,7 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
             return
         opcode, length = _FRAME.unpack_from(head)
         end = at + _FRAME.size + length
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+        if _ENDS.get(opcode) == length:
             return
         if end > size or not _is_record(opcode, length, head):
             # The record before may have had a wrong length, and chunks may lie inside of it.
@@ -171,6 +178,14 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
         else:
             yield from _one_record(opcode, file.read(length), at, losses)
         at = end
+
+
+def count_missing(summary: Summary | None, channel_id: int, seen: int, losses: Losses) -> None:
+    """Count the messages of a channel that a summary promises beyond those `seen`; `losses` is changed."""
+    channel = summary.channels.get(channel_id) if summary else None
+    missing = summary.message_counts.get(channel_id, 0) - seen if summary else 0
+    if channel and missing > 0:
+        losses.add("missing message", 0, f"topic {channel.topic!r}: {missing} not found", missing)
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
@@ -289,7 +304,24 @@ def _is_record(opcode: int, length: int, head: bytes) -> bool:
     """Whether a record may start with these bytes; types above 0x80 are private to whoever wrote them."""
     if opcode == Opcode.CHUNK:
         return _chunk_length(head, 0) == length
-    return Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 0x80
+    is_index = _is_index(length, head)
+    if opcode == Opcode.MESSAGE_INDEX:
+        return is_index
+    if is_index and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        return False  # nor make a message of what is none
+    # A damaged type must not end the file early, nor pass a chunk for something to step over.
+    if opcode in _ENDS or _chunk_length(head, 0) == length:
+        return False
+    return Opcode.HEADER <= opcode < Opcode.DATA_END or opcode >= 0x80
+
+
+def _is_index(length: int, head: bytes) -> bool:
+    """Whether a record has the shape of a message index: a length that agrees, an offset that may be one."""
+    if length < 6 or len(head) < 31:
+        return False
+    (size,) = struct.unpack_from("<I", head, 11)
+    (offset,) = struct.unpack_from("<Q", head, 23) if size else (0,)
+    return bool(length == 6 + size and size % 16 == 0 and offset <= MAX_RECORD_BYTES)
 
 
 def _chunk_length(block: bytes, at: int) -> int | None:

@@ -10,20 +10,31 @@ from typing import Any, Self
 
 import numpy as np
 
-from streamfeat.codecs import ENCODINGS, MAX_PACKET_EVENTS, Decoder, encode, make_decoder
+from streamfeat.codecs import (
+    ENCODINGS,
+    EVT3_WRAP_US,
+    MAX_PACKET_EVENTS,
+    Decoder,
+    Evt3Decoder,
+    encode,
+    make_decoder,
+)
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.json_fields import Fields
 from streamfeat.messages import EventArray, EventPacket, LabelMessage
 
-__all__ = ["EVENT_SCHEMAS", "Label", "Packet", "PacketReader", "PacketWriter", "Tick"]
+__all__ = ["EVENT_SCHEMAS", "MAX_PIXELS", "Label", "Packet", "PacketReader", "PacketWriter", "Tick"]
 
 EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
 """Messages that carry events."""
 
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
+_MOST_WRAPS = 86_400_000_000 // EVT3_WRAP_US  # in a day
 _MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
+MAX_PIXELS = 1 << 22
+"""Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +110,8 @@ class PacketReader:
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
+        self._is_broken = False
+        self._before: tuple[int, int] | None = None
 
     def read(self, schema: str, data: bytes | memoryview, log_time_ns: int, sequence: int) -> Packet:
         """Read one message; `sequence` stands in where the message has no number of its own.
@@ -120,7 +133,10 @@ class PacketReader:
         resolution = _resolution(packet.height, packet.width)
         if packet.encoding not in self._decoders:
             self._decoders[packet.encoding] = make_decoder(packet.encoding, self._max_events)
-        events = self._decoders[packet.encoding].decode(packet.events, packet.time_base)
+        decoder = self._decoders[packet.encoding]
+        events = decoder.decode(packet.events, packet.time_base)
+        if isinstance(decoder, Evt3Decoder) and len(events):
+            self._place(decoder, events, packet.stamp_ns)
         self.encoding = packet.encoding
         # The times of evt3 are the camera's own; its time_base is on another clock.
         timed = packet.time_base and packet.encoding != "evt3"
@@ -131,6 +147,8 @@ class PacketReader:
         """What decoders carry on, as JSON values."""
         return {
             "last_seq": self._last_seq,
+            "is_broken": self._is_broken,
+            "before": self._before,
             "decoders": {name: decoder.snapshot() for name, decoder in self._decoders.items()},
         }
 
@@ -141,14 +159,36 @@ class PacketReader:
             InputError: it is none.
         """
         self._last_seq = values.maybe("last_seq", 0, 1 << 64)
+        self._is_broken = values.flag("is_broken")
+        before = values.wholes("before", 2) if "before" in values else []
+        self._before = (before[0], before[1]) if len(before) == 2 else None
         decoders = values.inner("decoders")
         for name in ENCODINGS:
             if name in decoders:
                 self._decoders[name] = make_decoder(name, self._max_events)
                 self._decoders[name].restore(decoders.wholes(name, 8))
 
+    def _place(self, decoder: Evt3Decoder, events: Events, stamp_ns: int) -> None:
+        """After missing packets, count the wraps of 16.8 s that they would have shown, by the stamps around.
+
+        Args:
+            decoder: of the packet, changed.
+            events: of the packet, at least one, changed.
+            stamp_ns: of the packet.
+        """
+        if self._is_broken and self._before:
+            stamp_before_ns, last_us = self._before
+            expected_us = last_us + (stamp_ns - stamp_before_ns) // 1000
+            wraps = round((expected_us - int(events["t"][0])) / EVT3_WRAP_US)
+            if 0 < wraps <= _MOST_WRAPS:
+                decoder.count_wraps(wraps)
+                events["t"] += wraps * EVT3_WRAP_US
+        self._is_broken = False
+        self._before = stamp_ns, int(events["t"][-1])
+
     def resync(self) -> None:
         """Messages are missing: what came before says nothing about what follows."""
+        self._is_broken = True
         for decoder in self._decoders.values():
             decoder.resync()
 

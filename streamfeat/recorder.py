@@ -5,6 +5,7 @@ Lives here: `RecordingWriter`; cutting batches into packets, and never leaving h
 Not here: reading (`streamfeat.recording`), what bytes a message has (`streamfeat.messages`).
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from os import PathLike
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike
 from streamfeat.conventions import as_events
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.mcap_records import Losses, iter_messages, open_mcap, read_summary
+from streamfeat.mcap_records import Losses, count_missing, iter_messages, open_mcap, read_summary
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.packets import Label, PacketWriter
 
@@ -31,6 +32,8 @@ _COMPRESSION = {
     "lz4": CompressionType.LZ4,
     "none": CompressionType.NONE,
 }
+
+_MAX_CHANNELS = (1 << 16) - 1  # of a file, as the mcap package numbers them
 
 _Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
 
@@ -57,7 +60,7 @@ def recover(
     Raises:
         InputError: `source` is no MCAP file at all, or `target` exists or cannot be written.
     """
-    losses = Losses()
+    losses, copied = Losses(), Counter[int]()
     # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
     writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
     with writer, open_mcap(Path(source)) as file:
@@ -65,7 +68,10 @@ def recover(
         total = sum(summary.message_counts.values()) if summary else 0
         for done, (_, channel, schema, message) in enumerate(iter_messages(file, summary, losses), 1):
             writer._copy(channel, schema, message)
+            copied[channel.id] += 1
             report("recovering", done, total, "")
+    for channel_id in summary.message_counts if summary else ():
+        count_missing(summary, channel_id, copied[channel_id], losses)
     return losses
 
 
@@ -115,6 +121,7 @@ class RecordingWriter:
         self._event_topic, self._frame_id = event_topic, frame_id
         self._packets = PacketWriter(encoding, frame_id)
         self._channels: dict[str | int, int] = {}
+        self._schemas: dict[int, int] = {}
         self._check_target()
         try:
             self._file = self._part.open("xb")
@@ -267,11 +274,17 @@ class RecordingWriter:
     def _copy(self, channel: Channel, schema: Schema, message: Message) -> None:
         """Write a message of another recording as it is; do not mix with the public ways to write."""
         if channel.id not in self._channels:
-            schema_id = 0
-            if channel.schema_id:
-                schema_id = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            if len(self._channels) == _MAX_CHANNELS:
+                raise InputError(f"{self.path}: a recording has at most {_MAX_CHANNELS} channels")
+            if channel.schema_id and channel.schema_id not in self._schemas:
+                self._schemas[channel.schema_id] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
             self._channels[channel.id] = self._writer.register_channel(
-                channel.topic, channel.message_encoding, schema_id, channel.metadata
+                channel.topic,
+                channel.message_encoding,
+                self._schemas.get(channel.schema_id, 0),
+                channel.metadata,
             )
         times = message.log_time, message.data, message.publish_time
         self._add(self._channels[channel.id], *times, message.sequence)

@@ -22,9 +22,17 @@ from mcap.records import Channel, Schema
 
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.mcap_records import Losses, Summary, iter_messages, iter_records, open_mcap, read_summary
+from streamfeat.mcap_records import (
+    Losses,
+    Summary,
+    count_missing,
+    iter_messages,
+    iter_records,
+    open_mcap,
+    read_summary,
+)
 from streamfeat.messages import LabelMessage
-from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader
+from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -38,6 +46,8 @@ __all__ = [
 ]
 
 _LOOP_GAP_US = 1_000_000
+_MOST_OPEN_SAMPLES = 16
+"""Each holds its events, so labels without end would hold the recording once for each of them."""
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
@@ -138,7 +148,7 @@ class Recording:
         try:
             summary = read_summary(self._file)
             # Counts from a summary tell what should be there; a scan can only tell what is.
-            self._expected = summary.message_counts if summary else {}
+            self._has_summary = summary is not None
             self._known = summary or _scan(self._file)
             self.topics = _topics(self._known)
             self.topic = _choose_topic(
@@ -187,14 +197,17 @@ class Recording:
                     item = Label.from_cdr(message.data)
                 else:
                     item = reader.read(schema.name, message.data, message.log_time, message.sequence)
+                    self._check_size(item)
                     self.encoding = self.encoding or reader.encoding
             except InputError as error:
                 where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
                 losses.add("bad label" if is_label else "bad packet", len(message.data), where)
             else:
                 yield item
-        for channel_id in self._expected:
-            self._count_missing(channel_id, seen[channel_id], losses)
+        for channel_id, channel in self._known.channels.items() if self._has_summary else ():
+            kind = self._known.schemas.get(channel.schema_id)
+            if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
+                count_missing(self._known, channel_id, seen[channel_id], losses)
 
     def played(
         self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
@@ -229,7 +242,8 @@ class Recording:
     def samples(self) -> Iterator[Sample]:
         """Yield the labelled samples in stored order, with memory bounded by those open at a time.
 
-        A sample is complete when a packet starts, or a label begins, at or after its end.
+        A sample is complete when a packet starts, or a label begins, at or after its end; or when 16 more
+        have begun before its end.
         """
         pending: list[_PendingSample] = []
         for item in self.items():
@@ -237,6 +251,8 @@ class Recording:
             while now is not None and pending and now >= _end_us(pending[0].label):
                 yield pending.pop(0).finish(self.resolution)
             if isinstance(item, Label):
+                if len(pending) == _MOST_OPEN_SAMPLES:
+                    yield pending.pop(0).finish(self.resolution)
                 pending.append(_PendingSample(item))
             else:
                 for sample in pending:
@@ -289,21 +305,18 @@ class Recording:
         """Time from the earliest to the latest event."""
         return (self.last_us or 0) - (self.first_us or 0)
 
+    @staticmethod
+    def _check_size(packet: Packet) -> None:
+        height, width = packet.resolution
+        if height * width > MAX_PIXELS:
+            raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
+
     def _first_packet(self) -> Packet:
         for item in self.items():
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
-
-    def _count_missing(self, channel_id: int, seen: int, losses: Losses) -> None:
-        channel = self._known.channels.get(channel_id)
-        missing = self._expected.get(channel_id, 0) - seen
-        if channel is None or missing <= 0:
-            return
-        schema = self._known.schemas.get(channel.schema_id)
-        if channel.topic == self.topic or (schema and schema.name == LabelMessage.SCHEMA_NAME):
-            losses.add("missing message", 0, f"topic {channel.topic!r}: {missing} not found", missing)
 
 
 def _scan(file: BinaryIO) -> Summary:

@@ -48,7 +48,15 @@ def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDA
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        OSError,
+        SafetensorError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise InputError(f"{path}: not a readable safetensors file: {one_line(error)}") from error
     if not isinstance(header, dict) or header.get("format") != kind:
         raise InputError(f"{path}: a safetensors file, but not a {kind} file")

@@ -58,7 +58,13 @@ ROOMS = {
         {"dictionary", "transform"},
         {"fit"},
     ],
-    "foreign": [{"words"}, {"tables"}, {"containers"}, {"event_files"}, {"datasets"}],
+    "foreign": [
+        {"hdf5_process", "words"},
+        {"aedat4", "tables"},
+        {"containers"},
+        {"event_files"},
+        {"datasets"},
+    ],
     "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
     "live": [
         {"clock", "delivery", "inbox", "names"},

@@ -19,6 +19,7 @@ from streamfeat.codecs import ENCODINGS, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.packets import PacketWriter
 from streamfeat.recorder import RecordingWriter, recover
 from streamfeat.recording import Label, Packet, Topic, open_recording
 
@@ -194,6 +195,23 @@ def test_lost_packets_do_not_lend_their_state(tmp_path):
     assert read(path)[0].tolist() == [(3, 5, 0, 0), (1, 5, 0, 0)]
 
 
+@pytest.mark.parametrize("gaps_s", [(1, 1, 1), (20, 20, 20), (40, 3, 1), (1, 9, 300), (60, 90, 7)])
+def test_lost_evt3_packets_do_not_move_those_that_follow(tmp_path, gaps_s):
+    """Its clock wraps every 16.8 s, and the packets that would have shown it are lost."""
+    parts, start_us = [], 0
+    for i, gap_s in enumerate((0, *gaps_s)):
+        parts.append(random_events(30, 500_000, seed=i))
+        start_us += gap_s * 1_000_000
+        parts[-1]["t"] += start_us
+    writer = PacketWriter("evt3")
+    packets = [m.to_cdr() for part in parts for m in writer.messages(part, RESOLUTION)]
+    assert len(packets) == 4
+    for lost in range(1, 4):
+        kept = [p for i, p in enumerate(packets) if i != lost]
+        events, _ = read(write_messages(tmp_path / "a.mcap", *kept))
+        np.testing.assert_array_equal(events, np.concatenate([p for i, p in enumerate(parts) if i != lost]))
+
+
 # --- writing never harms
 
 
@@ -289,6 +307,7 @@ def test_no_recording(tmp_path, content, reason):
         (packet(payload=bytes(7)), "7 bytes are not a multiple of 8"),
         (packet(height=0), "height 0 and width 80 is not possible"),
         (packet(height=65_537), "height 65537"),
+        (packet(height=60_000), "80x60000 pixels; at most 4194304"),
         (packet()[:50], "cut short"),
     ],
 )
@@ -369,6 +388,43 @@ def test_damaged_chunk_costs_only_itself(tmp_path, chunked):
     assert losses.counts == {"damaged chunk": 1, "missing message": 1}
     assert losses.bytes["damaged chunk"] > 200
     assert f"byte {starts[7]}: " in losses.first["damaged chunk"]
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_damaged_type_costs_one_chunk_at_most(tmp_path, chunked, bit):
+    """Also where it says that the file ends here, or that this can be passed over."""
+    data, packets, starts = chunked
+    (length,) = struct.unpack_from("<Q", data, starts[7] + 1)
+    for at, cost in ((starts[7], 1), (starts[7] + 9 + length, 0)):  # the chunk, and the index behind it
+        damaged = data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+        found, losses = read_packets(tmp_path / "a.mcap", damaged)
+        assert found == packets[:7] + packets[7 + cost :]
+        assert "bad packet" not in losses.counts
+        told = recover(tmp_path / "a.mcap", tmp_path / "b.mcap", overwrite=True)
+        assert bool(losses) >= cost
+        assert bool(told) >= cost
+
+
+def test_damaged_first_bytes_cost_nothing(tmp_path, chunked):
+    data, packets, _ = chunked
+    for at, bit in ((at, bit) for at in range(8) for bit in range(8)):
+        damaged = data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+        if at == 5:  # the version: of another one, nobody knows what it means
+            with pytest.raises(InputError, match="is not an MCAP recording"):
+                read_packets(tmp_path / "a.mcap", damaged)
+        else:
+            assert read_packets(tmp_path / "a.mcap", damaged)[0] == packets
+
+
+def test_recover_tells_of_messages_that_the_summary_has_and_nobody_found(tmp_path, chunked):
+    data, packets, starts = chunked
+    # All lengths agree, and the chunk says that it is a message index.
+    damaged = data[: starts[7]] + b"\x07" + data[starts[7] + 1 :]
+    (tmp_path / "a.mcap").write_bytes(damaged)
+    losses = recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert losses.counts["missing message"] == 1
+    found, _ = read_packets(tmp_path / "c.mcap", (tmp_path / "b.mcap").read_bytes())
+    assert found == packets[:7] + packets[8:]
 
 
 def test_damaged_length_costs_one_chunk(tmp_path, chunked):

@@ -1,120 +1,85 @@
-"""Containers that a library opens: AEDAT 4 by faery, Prophesee HDF5 by h5py.
+"""Containers that a library opens: Prophesee HDF5 by h5py, in a process of its own.
 
-Lives here: the two libraries, imported when a file needs them, and what they do with damage.
-Not here: the words inside; both libraries hand out columns.
-
-faery yields the packets before a damaged one. dv-processing 2.0.4 refuses a file that was cut
-short and can hang on a flipped bit; eventcv 1.0.8 says nothing of what a damaged file
-lost, and holds the whole file in memory at 32 bytes an event. All three are quicker than packets are written.
+Lives here: that process, what it tells, and what becomes of a file whose process does not end in order.
+Not here: what it does with h5py (`hdf5_process`), and columns (`tables`).
 """
 
-import importlib
+import subprocess
+import sys
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution, make_events
+from streamfeat.events import Events, Resolution
+from streamfeat.foreign.hdf5_process import FRAME
 from streamfeat.foreign.tables import checked_events, named_columns, one_line
-from streamfeat.foreign.words import Source, checked_resolution, declared_resolution
+from streamfeat.foreign.words import Source, declared_resolution
 
-__all__ = ["aedat4_resolution", "hdf5_resolution", "read_aedat4", "read_hdf5"]
-
-_HDF5_ROWS = 1_000_000
+__all__ = ["hdf5_resolution", "read_hdf5"]
 
 
-def aedat4_resolution(path: Path) -> Resolution:
-    """`(height, width)` of the one event stream."""
-    try:
-        tracks = _library("faery", path).aedat.Decoder(path).tracks()
-    except BaseException as error:
-        if not _is_damage(error):
-            raise
-        raise InputError(
-            f"{path}: AEDAT4 header or index is cut short or damaged: {one_line(error)}"
-        ) from error
-    sizes = [track.dimensions for track in tracks if track.data_type == "events"]
-    if len(sizes) != 1:
-        raise InputError(f"{path}: has {len(sizes)} event streams; only files with one are read")
-    return checked_resolution(path, sizes[0][1], sizes[0][0])
-
-
-def read_aedat4(file: Source) -> Iterator[Events]:
-    """Packets of the first event stream; where one is damaged, those before it are kept."""
-    n = 0
-    try:
-        for track, packet in _library("faery", file.path).aedat.Decoder(file.path):
-            if track.data_type == "events":
-                n += len(packet)
-                yield make_events(packet["x"], packet["y"], packet["on"], packet["t"])
-    except BaseException as error:
-        if not _is_damage(error):
-            raise
-        if n == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {one_line(error)}") from error
-        file.lose(0, f"everything after event {n} is lost: {one_line(error)}")
-
-
-def _is_damage(error: BaseException) -> bool:
-    """Whether faery means the file: a RuntimeError, or a panic of its parser.
-
-    A panic is a `PanicException`, which is no `Exception` and belongs to no module that can be imported.
-    """
-    return isinstance(error, RuntimeError) or type(error).__name__ == "PanicException"
+class _DamageError(Exception):
+    """The file, or what the library makes of it."""
 
 
 def hdf5_resolution(path: Path) -> Resolution | None:
     """`(height, width)` of the attribute `geometry`, where there is one."""
     try:
-        with _library("h5py", path).File(path, "r") as root:
-            _hdf5_dataset(path, root)
-            geometry = root.attrs.get("geometry", root["CD"].attrs.get("geometry", ""))
-    except InputError:
-        raise
-    except Exception as error:  # h5py passes on whatever the HDF5 library made of the damage
-        raise InputError(f"{path}: HDF5 file is cut short or damaged: {one_line(error)}") from error
-    text = geometry.decode("ascii", "replace") if isinstance(geometry, bytes) else str(geometry)
-    return declared_resolution(path, {"geometry": text})
+        for kind, data in _frames(path):
+            if kind == b"g":
+                return declared_resolution(path, {"geometry": data.decode("ascii", "replace")})
+    except _DamageError as error:
+        raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
+    return None
 
 
 def read_hdf5(file: Source) -> Iterator[Events]:
     """Rows of `CD/events`; where a chunk is damaged, those before it are kept."""
-    row = 0
+    n = 0
+    columns: dict[str, NDArray[Any]] = {}
     try:
-        with _library("h5py", file.path).File(file.path, "r") as root:
-            dataset = _hdf5_dataset(file.path, root)
-            for row in range(0, len(dataset), _HDF5_ROWS):
-                rows = dataset[row : row + _HDF5_ROWS]
-                yield checked_events(
-                    file.path, row, named_columns(file.path, {n: rows[n] for n in rows.dtype.names})
-                )
-    except InputError:
-        raise
-    except Exception as error:  # as above
-        if row == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {one_line(error)}") from error
-        file.lose(0, f"everything after event {row} is lost: {one_line(error)}")
+        for kind, data in _frames(file.path):
+            if kind == b"b":
+                events = checked_events(file.path, n, named_columns(file.path, columns))
+                yield events
+                n += len(events)
+                columns = {}
+            elif kind != b"g":
+                columns[kind.decode()] = np.load(BytesIO(data), allow_pickle=False)
+    except _DamageError as error:
+        if n == 0:
+            raise InputError(f"{file.path}: damaged before the first event: {error}") from error
+        file.lose(0, f"everything after event {n} is lost: {error}")
 
 
-def _hdf5_dataset(path: Path, root: Any) -> Any:
-    """`CD/events` of an open file, once it is known that its codec is there."""
-    h5py = _library("h5py", path)
-    dataset = root.get("CD/events")
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.names is None:
-        raise InputError(f"{path}: has no CD/events table, so it is not a Prophesee HDF5 event file")
-    filters = dataset.id.get_create_plist()
-    for code, name in ((f[0], f[3]) for f in map(filters.get_filter, range(filters.get_nfilters()))):
-        if not h5py.h5z.filter_avail(code):
-            raise InputError(
-                f"{path}: is compressed with HDF5 filter {code} ({name.decode('ascii', 'replace')}), "
-                "which is not installed; for ECF (36559) build github.com/prophesee-ai/hdf5_ecf and set "
-                "HDF5_PLUGIN_PATH"
-            )
-    return dataset
+def _frames(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """What the other process tells, but for how it ended.
 
-
-def _library(name: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(f"{path}: reading it needs {name}: pip install 'streamfeat[convert]'") from error
+    Raises:
+        InputError: it refuses the file.
+        _DamageError: the library gave up, or did not come to an end.
+    """
+    # -P: the folder that somebody works in is no place to import from.
+    command = [sys.executable, "-P", "-m", "streamfeat.foreign.hdf5_process", str(path.resolve())]
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
+        assert process.stdout
+        try:
+            while len(head := process.stdout.read(FRAME.size)) == FRAME.size:
+                kind, length = FRAME.unpack(head)
+                data = process.stdout.read(length)
+                if kind == b"z":
+                    return
+                if kind == b"r":
+                    raise InputError(f"{path}: {data.decode()}")
+                if kind == b"d":
+                    raise _DamageError(one_line(ValueError(data.decode())))
+                yield kind, data
+        finally:
+            process.kill()  # nobody reads on
+        raise _DamageError("the HDF5 library does not come to an end, or fails")

@@ -1,8 +1,8 @@
 """One foreign event file -> batches of events.
 
 Lives here: which format a file has, its resolution where it says so, and its events, read lazily in batches.
-Not here: the formats themselves (`words`, `containers`, `tables`), folders and labels (`datasets`), and
-MCAP (`streamfeat.recording`).
+Not here: the formats themselves (`words`, `aedat4`, `containers`, `tables`), folders and labels (`datasets`),
+and MCAP (`streamfeat.recording`).
 """
 
 from collections.abc import Callable, Iterator
@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.errors import InputError
+from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.foreign.containers import aedat4_resolution, hdf5_resolution, read_aedat4, read_hdf5
+from streamfeat.foreign.aedat4 import aedat4_resolution, read_aedat4
+from streamfeat.foreign.containers import hdf5_resolution, read_hdf5
 from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
 from streamfeat.foreign.words import (
     declared_resolution,
@@ -90,7 +91,7 @@ class EventFile:
     def lose(self, n_bytes: int, why: str) -> None:
         """Note a loss while reading."""
         self.lost_bytes += n_bytes
-        self.damage.append(why)
+        self.damage.append(printable(why))
 
 
 @dataclass(frozen=True, slots=True)

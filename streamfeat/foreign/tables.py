@@ -72,6 +72,8 @@ def read_numpy(file: Source) -> Iterator[Events]:
                 if unpacked > _LARGEST_UNPACKED:
                     raise ValueError(f"{unpacked} bytes when unpacked, more than {_LARGEST_UNPACKED}")
                 columns = {name: loaded[name] for name in loaded.files}
+                if not all(isinstance(column, np.ndarray) for column in columns.values()):
+                    raise ValueError("a member is no array")
     except Exception as error:  # zip, zlib and header parsers raise a dozen unrelated types on damage
         raise InputError(
             f"{file.path}: not a readable NumPy file without pickles: {one_line(error)}"
@@ -97,8 +99,14 @@ def named_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> dict[str, 
     if any(column.dtype.kind not in "biuf" for column in picked.values()):
         raise InputError(f"{path}: columns x, y, p, t must be numbers")
     if picked["t"].dtype.kind == "f":
-        picked["t"] = np.rint(picked["t"] * 1e6)
+        picked["t"] = _microseconds(picked["t"])
     return picked
+
+
+def _microseconds(seconds: NDArray[Any]) -> NDArray[np.float64]:
+    """Whole microseconds; infinite where there is no such time."""
+    with np.errstate(over="ignore"):
+        return np.rint(seconds.astype(np.float64) * 1e6)
 
 
 def checked_events(path: Path, first_row: int, columns: Mapping[str, NDArray[Any]]) -> Events:
@@ -177,5 +185,5 @@ def _text_events(path: Path, first_row: int, lines: list[str], layout: _TextLayo
             f"{path}: after event {first_row}: {one_line(error)}; expected lines of numbers 't x y p'"
         ) from error
     return checked_events(
-        path, first_row, {"x": x, "y": y, "p": p, "t": np.rint(t * 1e6) if layout.in_seconds else t}
+        path, first_row, {"x": x, "y": y, "p": p, "t": _microseconds(t) if layout.in_seconds else t}
     )

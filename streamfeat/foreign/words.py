@@ -71,7 +71,7 @@ def declared_resolution(path: Path, fields: Mapping[str, str]) -> Resolution | N
     """`(height, width)` of a header, else of the sensor generation it names, else None."""
     described = f"{fields.get('geometry', '')};{fields.get('format', '')}".lower()
     width, height = fields.get("width", ""), fields.get("height", "")
-    if match := re.search(r"(\d+)x(\d+)", described):
+    if match := re.search(r"(?<!\d)(\d+)x(\d+)", described):
         width, height = match.groups()
     elif "width=" in described and "height=" in described:
         width, height = (described.partition(f"{k}=")[2].partition(";")[0] for k in ("width", "height"))

@@ -29,14 +29,13 @@ from streamfeat.live.names import Attachment
 from streamfeat.live.topic import (
     MAX_LABEL_US,
     MAX_PACKET_EVENTS,
-    MAX_PIXELS,
     MAX_STREAM_US,
     MAX_TOPICS,
     Mark,
     TopicState,
 )
 from streamfeat.messages import EventPacket, LabelMessage
-from streamfeat.packets import EVENT_SCHEMAS, Label, Packet, PacketReader, Tick
+from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader, Tick
 
 __all__ = ["MAX_PAYLOAD_BYTES", "Intake", "Warnings"]
 

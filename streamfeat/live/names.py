@@ -199,7 +199,7 @@ class RosNames:
 
     def schema(self, key: str, encoding: str) -> str | None:
         """See `Names`."""
-        return schema_of_ros(key.split("/")[-2])
+        return schema_of_ros(key.rpartition("/")[0].rpartition("/")[2])
 
     def topic(self, key: str) -> str:
         """See `Names`."""

@@ -12,12 +12,11 @@ from streamfeat.events import Resolution
 from streamfeat.json_fields import Fields
 from streamfeat.live.clock import CameraClock
 from streamfeat.live.delivery import Delivery
-from streamfeat.packets import PacketReader
+from streamfeat.packets import MAX_PIXELS, PacketReader
 
 __all__ = [
     "MAX_LABEL_US",
     "MAX_PACKET_EVENTS",
-    "MAX_PIXELS",
     "MAX_STREAM_US",
     "MAX_TOPICS",
     "Mark",
@@ -26,8 +25,6 @@ __all__ = [
 ]
 
 MAX_PACKET_EVENTS = 1 << 20
-MAX_PIXELS = 1 << 22
-"""The largest event sensors have 2^20."""
 MAX_TOPICS = 256
 MAX_LABEL_US = 3_600_000_000
 MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US

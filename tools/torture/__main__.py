@@ -19,13 +19,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
+from tools.torture.damage import damaged_recordings  # noqa: E402
 from tools.torture.faults import faults  # noqa: E402
+from tools.torture.fuzz import hostile_bytes  # noqa: E402
 from tools.torture.kills import kills  # noqa: E402
 from tools.torture.soak import soak  # noqa: E402
 from tools.torture.state import state  # noqa: E402
 from tools.torture.table import Part, Row, Trials, markdown  # noqa: E402
 
 PARTS: dict[str, tuple[Part, str]] = {
+    "bytes": (hostile_bytes, "every decoder, fed with hostile bytes"),
+    "damage": (damaged_recordings, "recordings cut short, or with bits flipped"),
     "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
     "state": (state, "kill -9 of a listener that keeps its state"),
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
