@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +25,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema, Statistics
+from mcap.records import Channel, Chunk, Header, Message, Schema, Statistics
 
 from streamfeat.errors import InputError, printable
 
@@ -155,7 +156,8 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
         end = at + _FRAME.size + length
         if _ENDS.get(opcode) == length:
             return
-        if end > size or not _is_record(opcode, length, head):
+        wrong = end > size or not _is_record(opcode, length, head)
+        if wrong or (opcode == Opcode.HEADER and _swallows_a_chunk(file, at, end, size)):
             # The record before may have had a wrong length, and chunks may lie inside of it.
             following = _find_chunk(file, trusted + 1, size)
             reason = "truncated" if following is None and end > size else "damaged record"
@@ -298,6 +300,19 @@ def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:
             if length is not None and at + _FRAME.size + length <= size:
                 return at
     return None
+
+
+def _swallows_a_chunk(file: BinaryIO, at: int, end: int, size: int) -> bool:
+    """Whether a file's header is longer than its two strings, so that stepping over it leaves out a chunk."""
+    file.seek(at + _FRAME.size)
+    body = file.read(min(end - at - _FRAME.size, _SCAN_BYTES))
+    stream = ReadDataStream(BytesIO(body))
+    with suppress(*_DAMAGE):
+        Header.read(stream)
+        if stream.count == len(body):
+            return False
+    following = _find_chunk(file, at + 1, size)
+    return following is not None and following < end
 
 
 def _is_record(opcode: int, length: int, head: bytes) -> bool:

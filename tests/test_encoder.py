@@ -513,7 +513,7 @@ def test_a_failed_save_leaves_the_earlier_model(saved, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("streamfeat.files.os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(InputError, match="No space left"):
         known_encoder(("direct", "split")).save(saved)
     assert saved.read_bytes() == before
     assert only(saved.parent) == [saved.name]

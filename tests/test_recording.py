@@ -456,6 +456,16 @@ def test_damaged_length_of_a_skipped_record_costs_nothing(tmp_path, chunked):
     assert losses.counts == {"damaged record": 1}
 
 
+def test_damaged_length_of_the_header_costs_nothing(tmp_path, chunked):
+    data, packets, starts = chunked
+    assert data[8] == 1
+    for end in (starts[2], starts[3], starts[3] + 40):  # where a record begins, and where none does
+        damaged = data[:9] + struct.pack("<Q", end - 17) + data[17:]
+        found, losses = read_packets(tmp_path / "a.mcap", damaged)
+        assert found == packets
+        assert losses.counts == {"damaged record": 1}
+
+
 def test_overwritten_block_costs_what_it_covers(tmp_path, chunked):
     data, packets, starts = chunked
     hole = data[: starts[5] - 3] + bytes(starts[8] - starts[5]) + data[starts[8] - 3 :]
