@@ -57,7 +57,7 @@ ROWS = {
         f"{HERE}::test_a_recording_that_has_no_more_room_can_be_recovered",
         "test_state.py::test_a_file_that_cannot_be_written_does_not_end_the_job",
     ],
-    "a source stalls": [
+    "a camera stalls": [
         "test_live_listen.py::test_a_silent_camera_decays_to_nothing",
         "test_pipeline.py::test_a_live_source_that_says_nothing_can_be_left",
     ],
