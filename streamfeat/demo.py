@@ -5,8 +5,12 @@ Not here: each step itself (`simulate`, `learn`, `classifier`, `session`), and t
 """
 
 import shlex
+import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +22,7 @@ from streamfeat.emission import Emission, EmitPolicy
 from streamfeat.encoder import Encoder
 from streamfeat.events import make_events
 from streamfeat.features import encode_samples
+from streamfeat.geometry import Geometry
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.setting import Setting
 from streamfeat.packets import Packet
@@ -60,7 +65,22 @@ class Demo:
         """Nothing is written before `simulate`."""
         self.train, self.test, self.model, self.classifier = (folder / name for name in FILES)
         self._report = report
+        self._compiler: BaseProcess | None = None
         self.interrupted = False
+
+    @contextmanager
+    def compiling(self) -> Iterator[None]:
+        """Compile on another core while the block runs, into numba's cache, where `compile` finds it."""
+        self._compiler = get_context("spawn").Process(target=_compile_kernels, daemon=True)
+        # Ctrl-C is for this process, which ends the other; that one is born deaf to it.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        self._compiler.start()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        try:
+            yield
+        finally:
+            self._compiler.terminate()
+            self._compiler.join()
 
     def simulate(self) -> int:
         """Write both recordings, and return how many events they have."""
@@ -96,9 +116,10 @@ class Demo:
         """Compile what encoding and replaying would otherwise wait for, without a word, when first needed."""
         remark = "kernels, kept for the next time"
         self._report("compiling", 0, 2, remark)
-        encoder.encode(make_events([0], [0], [1], [0]), CameraModel().resolution)
+        if self._compiler:
+            self._compiler.join()
         self._report("compiling", 1, 2, remark)
-        warm_up(encoder, _POLICY)
+        _use_kernels(encoder)
         self._report("compiling", 2, 2, remark)
 
     def fit(self, encoder: Encoder) -> Classifier:
@@ -156,6 +177,28 @@ class Demo:
             f"--max-count {_SETTING.max_count} --filters {_SETTING.filters} --volumes {_SETTING.volumes} "
             f"--iterations {_SETTING.iterations}",
         ]
+
+
+def _use_kernels(encoder: Encoder) -> None:
+    encoder.encode(make_events([0], [0], [1], [0]), CameraModel().resolution)
+    warm_up(encoder, _POLICY)
+
+
+def _compile_kernels() -> None:
+    """What kernels are compiled for are types: an encoder that has learned nothing does."""
+    geometry = Geometry(patch=_SETTING.patch, n_bins=1, bin_us=1_000)
+    d = geometry.patch**2
+    _use_kernels(
+        Encoder.build(
+            geometry,
+            formulation="direct",
+            encoding="split",
+            threshold=0.1,
+            filters=np.eye(2, d, dtype=np.float32),
+            whitening=np.eye(d, dtype=np.float32),
+            mean=np.zeros(d, np.float32),
+        )
+    )
 
 
 class _Watched:

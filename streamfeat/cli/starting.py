@@ -54,9 +54,10 @@ def demo(
     try:
         with progress_bars(quiet=quiet) as report:
             job = Demo(folder, report)
-            simulated = job.simulate()
-            encoder = job.learn()
-            job.compile(encoder)
+            with job.compiling():
+                simulated = job.simulate()
+                encoder = job.learn()
+                job.compile(encoder)
             classifier = job.fit(encoder)
         replayed = job.replay(encoder, classifier, None if quiet or as_json else out)
     except KeyboardInterrupt:
