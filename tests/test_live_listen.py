@@ -207,7 +207,7 @@ def test_word_that_a_camera_leaves_may_overtake_its_last_packets(files, monkeypa
                 camera.put(message(events, i), attachment=attachment(i + 1, gid))
             # The next one need not wait until this one is released, and begins anew.
             until(lambda life=life: job.result()["packets"] == 12 * (life + 1), lambda: f"{job.result()}")
-        assert job._cameras.topics == [key]
+        until(lambda: job._cameras.topics == [key], "the second one's session")
         monkeypatch.setattr(intake, "GRACE_S", 0.0)
         until(lambda: job._cameras.topics == [], lambda: f"nobody, {vars(job._intake)}")
     packets = [tiny.packet(events) for events in sent]
