@@ -1,6 +1,6 @@
 """Break streamfeat in every way we know, and count what survives.
 
-    python tools/torture                          # everything, under half an hour
+    python tools/torture                          # everything
     python tools/torture --only damage,kills      # these parts
     python tools/torture --scale 0.01             # a hundredth of the trials: does it run?
     python tools/torture --json out.json          # the rows as JSON, too
