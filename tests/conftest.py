@@ -16,6 +16,17 @@ settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50
 settings.load_profile("ci" if os.environ.get("CI") else "default")
 
 
+# Real sessions, processes and clocks, on machines that others share: a failure counts if it comes again.
+# All other tests have one try. What was tried again is in the last line of the run.
+WITH_CLOCKS = ("test_live_", "test_view_", "test_cluster", "test_pipeline", "test_what_happens", "test_state")
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.name.startswith(WITH_CLOCKS):
+            item.add_marker(pytest.mark.flaky(reruns=2))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings, which are not part of the repository."""

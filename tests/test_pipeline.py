@@ -371,9 +371,9 @@ def test_the_recorded_pace_is_kept():
     items = [tiny.packet(tiny.steady(0, 400_000, 2000))]
     started = time.monotonic()
     asyncio.run(Pipeline(items, session("100ms"), [sink], speed=2.0).run())
-    assert time.monotonic() - started > 0.19
-    assert len(sink.parts) == 4
-    assert arrived[-1] - arrived[0] > 0.1
+    assert len(sink.parts) == len(arrived) == 4
+    # A loaded machine may be late with any of them, but none is early.
+    assert all(when - started > 0.05 * nth - 0.01 for nth, when in enumerate(arrived, 1))
     same(sink.emissions, plain_loop(items, "100ms")[0])
 
 

@@ -194,6 +194,20 @@ def test_a_page_without_anything_to_show_says_so(tab, tmp_path):
 
 
 @needs_chromium
+def test_a_subscription_that_came_too_soon_is_made_again(tab, tmp_path):
+    with shown(tmp_path, tiny.labelled_items(1)) as url:
+        look(tab, url)
+        tab.value("sent = []; stream.send = (message) => sent.push(message); 0")
+        wanted = tab.value("[...stream.wanted]")
+        for _, channel in wanted:
+            tab.value(f"stream.refused('Unknown channel ID: {channel}'); 0")
+        tab.value("stream.refused('Unknown channel ID: 987654'); stream.refused('something else'); 0")
+        tab.until(f"sent.length >= {len(wanted)}")
+        again = [one["subscriptions"][0] for one in tab.value("sent")]
+    assert [[one["id"], one["channelId"]] for one in again] == wanted
+
+
+@needs_chromium
 def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
     board = LiveBoard(about(MODEL, ()), "test", 0)
     server = PageServer(page(board.port), 0)

@@ -53,7 +53,10 @@ class Client:
             channel = self._ending(ending)
             number = len(self._subscriptions) + 1
             self._subscriptions[number] = channel
-            self._send({"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel["id"]}]})
+            self._ask(number, channel["id"])
+
+    def _ask(self, number, channel_id):
+        self._send({"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel_id}]})
 
     def message(self):
         """The next message: (topic, log time in ns, payload)."""
@@ -82,6 +85,13 @@ class Client:
         elif message["op"] == "unadvertise":
             for number in message["channelIds"]:
                 self.channels.pop(number)
+        elif message["op"] == "status" and message["message"].startswith("Unknown channel ID: "):
+            # The server tells of a channel a moment before it knows it itself; the page asks again, too.
+            refused = int(message["message"].rpartition(" ")[2])
+            for number, channel in self._subscriptions.items():
+                if channel["id"] == refused and refused in self.channels:
+                    time.sleep(0.05)
+                    self._ask(number, refused)
 
     def _frame(self):
         first, length = self._take(2)

@@ -85,7 +85,7 @@ def router_killed(arguments: Namespace) -> dict[str, Any]:
         again.stdout.readline()
         back = time.perf_counter()
         recovered = reader.next_after(back, 30)
-        return _after(recovered, camera, one)
+        return _after(recovered, camera, one, reader)
 
 
 def subscriber_stopped(arguments: Namespace) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def subscriber_stopped(arguments: Namespace) -> dict[str, Any]:
             on = time.perf_counter()
             one.send_signal(signal.SIGCONT)
             recovered = reader.next_after(on, 30)
-            return _after(recovered, camera, one)
+            return _after(recovered, camera, one, reader)
 
 
 def network_cut(arguments: Namespace) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def network_cut(arguments: Namespace) -> dict[str, Any]:
         time.sleep(arguments.cut)
         subprocess.run(["ip", "-n", space, "link", "set", inside, "up"], check=True)
         up = time.perf_counter()
-        return _after(reader.next_after(up, 30), camera, one)
+        return _after(reader.next_after(up, 30), camera, one, reader)
 
 
 def _playing(
@@ -150,11 +150,12 @@ def _steady(reader: Reader, timeout: float = 90.0) -> None:
         raise SystemExit("no features come at all")
 
 
-def _after(recovered: float | None, camera: Process, one: Process) -> dict[str, Any]:
+def _after(recovered: float | None, camera: Process, one: Process, reader: Reader) -> dict[str, Any]:
     """Let it run on for some seconds, end the camera and then the listener, and compare what they counted."""
     time.sleep(3)
     published = finish(camera)["packets"]
-    time.sleep(0.5)
+    while reader.next_after(time.perf_counter(), 1) is not None:
+        pass  # what was under way when the camera ended still arrives
     result = _counts(finish(one))
     missing = published - sum(result[name] for name in ("packets", "unheard", "lost", "dropped"))
     return {

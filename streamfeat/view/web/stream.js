@@ -3,6 +3,7 @@
 const PROTOCOLS = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 const MESSAGE_DATA = 1;
 const AGAIN_MS = 1000;
+const SOON_MS = 50;
 
 /** Calls `onChannels(channels)`, `onMessage(channel, message)`, `onOpen()` and `onClose()`. */
 class Stream {
@@ -46,8 +47,21 @@ class Stream {
     const message = JSON.parse(text);
     if (message.op === "advertise") message.channels.forEach((channel) => this.channels.set(channel.id, channel));
     else if (message.op === "unadvertise") message.channelIds.forEach((id) => this.channels.delete(id));
-    else return;
+    else {
+      if (message.op === "status") this.refused(message.message);
+      return;
+    }
     this.listener.onChannels([...this.channels.values()]);
+  }
+
+  /** The server tells of a channel a moment before it knows it itself: who subscribes at once may be refused. */
+  refused(text) {
+    const refusedId = Number(/^Unknown channel ID: (\d+)/.exec(text)?.[1]);
+    for (const [id, channelId] of this.wanted) {
+      if (channelId !== refusedId || !this.channels.has(channelId)) continue;
+      const again = () => this.wanted.get(id) === channelId && this.send({ op: "subscribe", subscriptions: [{ id, channelId }] });
+      setTimeout(again, SOON_MS);
+    }
   }
 
   given(buffer) {
