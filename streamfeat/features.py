@@ -18,7 +18,8 @@ from sklearn.base import BaseEstimator, TransformerMixin
 
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Recording, Sample
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Losses, Recording, Sample
+from streamfeat.workers import HERE, Workers
 
 __all__ = [
     "EncodedSamples",
@@ -96,6 +97,7 @@ def encode_recordings(
     report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
     *,
     mirror: bool = False,
+    workers: Workers = HERE,
 ) -> EncodedSamples:
     """Encode all labelled samples of recordings, or the mirror images of those that are not held out.
 
@@ -104,25 +106,39 @@ def encode_recordings(
         recordings: open recordings.
         report: called with (step, done, of how many, remark).
         mirror: encode mirror images, of training samples only.
+        workers: read and encode.
     """
-    labels = [label for recording in recordings for label in recording.labels]
-    if mirror:
-        labels = [label for label in labels if label.split not in HELD_OUT_SPLITS]
-    rows = np.empty((len(labels), encoder.n_features), np.float32)
-    done = 0
+    labels: list[Label] = []
+    rows: list[NDArray[np.float32]] = []
+    step = "encoding mirrored" if mirror else "encoding"
     for recording in recordings:
-        samples = recording.samples()
-        if mirror:
-            samples = (mirrored(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
-        for _, row in encode_samples(encoder, samples):
-            rows[done] = row
-            done += 1
-            report("encoding mirrored" if mirror else "encoding", done, len(labels), recording.path.name)
+        losses, parts = Losses(), [(recording.part(part),) for part in recording.parts()]
+        found = workers.map(_encode_part, parts, workers.hold(encoder), mirror)
+        for done, (names, encoded, lost) in enumerate(found, 1):
+            labels += names
+            rows.append(encoded)
+            losses.add_all(lost)
+            report(step, done, len(parts), f"{recording.path.name}, {len(labels):,} samples")
+        recording.losses = losses
     return EncodedSamples(
-        rows,
+        np.concatenate(rows) if rows else np.empty((0, encoder.n_features), np.float32),
         np.array([label.label for label in labels], str),
         np.array([label.split in HELD_OUT_SPLITS for label in labels], bool),
     )
+
+
+def _encode_part(
+    opener: Callable[[], Recording], encoder: FeatureMap, mirror: bool
+) -> tuple[list[Label], NDArray[np.float32], Losses]:
+    with opener() as recording:
+        samples = recording.samples()
+        if mirror:
+            samples = (mirrored(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
+        encoded = [*encode_samples(encoder, samples, threads=1)]
+        rows = np.empty((len(encoded), encoder.n_features), np.float32)
+        for row, (_, features) in zip(rows, encoded, strict=True):
+            row[:] = features
+        return [label for label, _ in encoded], rows, recording.losses
 
 
 def training_set(

@@ -8,6 +8,7 @@ length is compared with the file before it is used, one record is in memory at a
 uncompressed chunk may exceed `MAX_RECORD_BYTES`.
 """
 
+import math
 import os
 import re
 import struct
@@ -25,7 +26,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Message, Schema, Statistics
+from mcap.records import Channel, Chunk, ChunkIndex, Header, Message, Schema, Statistics
 
 from streamfeat.errors import InputError, printable
 
@@ -76,6 +77,12 @@ class Losses:
         if reason not in self.first:
             self.first[reason] = printable(where)
 
+    def add_all(self, others: "Losses") -> None:
+        """Count the losses of another part of the same recording."""
+        self.counts += others.counts
+        self.bytes += others.bytes
+        self.first = others.first | self.first
+
     def __bool__(self) -> bool:
         """Whether anything was lost."""
         return bool(self.counts)
@@ -89,6 +96,8 @@ class Summary:
     channels: dict[int, Channel] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages of each channel id."""
+    chunk_starts: list[int] = field(default_factory=list)
+    """The byte where each chunk starts."""
 
 
 def open_mcap(path: Path) -> BinaryIO:
@@ -112,7 +121,7 @@ def open_mcap(path: Path) -> BinaryIO:
 
 
 def iter_messages(
-    file: BinaryIO, known: Summary | None, losses: Losses
+    file: BinaryIO, known: Summary | None, losses: Losses, start: int = 0, end: float = math.inf
 ) -> Iterator[tuple[int, Channel, Schema, Message]]:
     """Yield messages in file order, each with its byte (see `iter_records`), channel and schema.
 
@@ -120,10 +129,14 @@ def iter_messages(
         file: opened by `open_mcap`.
         known: what the summary said; its channels stand in for those lost in a damaged chunk.
         losses: changed.
+        start: see `iter_records`.
+        end: see `iter_records`.
     """
     schemas = {0: _NO_SCHEMA} | (known.schemas if known else {})
     channels = dict(known.channels if known else {})
-    for at, record in iter_records(file, losses):
+    for at, record in iter_records(file, losses, start, end):
+        if at >= end:
+            losses = Losses()
         if isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Schema):
@@ -138,29 +151,39 @@ def iter_messages(
                 yield at, channel, schema, record
 
 
-def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]:
+def iter_records(
+    file: BinaryIO, losses: Losses, start: int = 0, end: float = math.inf
+) -> Iterator[tuple[int, Record]]:
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
     Messages of a chunk carry the byte of the chunk. Damage is skipped up to the next readable record or
     chunk and counted in `losses`, which is changed. Nothing is raised but `OSError`.
+
+    Args:
+        file: opened by `open_mcap`.
+        losses: changed.
+        start: the byte of a chunk to begin with; 0 for the first record.
+        end: from this byte on losses are not counted, for somebody else does.
     """
     size = file.seek(0, os.SEEK_END)
-    at = trusted = len(_MAGIC)  # up to `trusted`, records start where we think they do
+    at = trusted = max(start, len(_MAGIC))  # up to `trusted`, records start where we think they do
     while True:
+        if at >= end:
+            losses = Losses()
         file.seek(at)
         head = file.read(_CHUNK_HEAD_BYTES)
         if len(head) < _FRAME.size:
             losses.add("truncated", len(head), f"byte {at}: the file ends without an end-of-data record")
             return
         opcode, length = _FRAME.unpack_from(head)
-        end = at + _FRAME.size + length
+        after = at + _FRAME.size + length
         if _ENDS.get(opcode) == length:
             return
-        wrong = end > size or not _is_record(opcode, length, head)
-        if wrong or (opcode == Opcode.HEADER and _swallows_a_chunk(file, at, end, size)):
+        wrong = after > size or not _is_record(opcode, length, head)
+        if wrong or (opcode == Opcode.HEADER and _swallows_a_chunk(file, at, after, size)):
             # The record before may have had a wrong length, and chunks may lie inside of it.
             following = _find_chunk(file, trusted + 1, size)
-            reason = "truncated" if following is None and end > size else "damaged record"
+            reason = "truncated" if following is None and after > size else "damaged record"
             where = f"byte {at}: record type {opcode} with {length} bytes cannot be here"
             start = at if following is None or following > at else trusted
             losses.add(reason, (following or size) - start, where)
@@ -176,10 +199,10 @@ def iter_records(file: BinaryIO, losses: Losses) -> Iterator[tuple[int, Record]]
             losses.add("oversized", length, f"byte {at}: a record of {length} bytes")
         elif opcode == Opcode.CHUNK:
             yield from _chunk_records(file.read(length), at, losses)
-            trusted = end
+            trusted = after
         else:
             yield from _one_record(opcode, file.read(length), at, losses)
-        at = end
+        at = after
 
 
 def count_missing(summary: Summary | None, channel_id: int, seen: int, losses: Losses) -> None:
@@ -226,6 +249,8 @@ def _parse_summary(section: bytes) -> Summary | None:
                 summary.channels[channel.id] = channel
             elif opcode == Opcode.STATISTICS:
                 summary.message_counts = Statistics.read(body).channel_message_counts
+            elif opcode == Opcode.CHUNK_INDEX:
+                summary.chunk_starts.append(ChunkIndex.read(body).chunk_start_offset)
     except _DAMAGE:
         return None
     return summary if summary.channels else None

@@ -8,10 +8,11 @@ A recording is read in file order with one packet in memory at a time. What cann
 counted in `Recording.losses`; only a recording that yields nothing at all is an error.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +22,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from streamfeat.errors import InputError
-from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import (
     Losses,
     Summary,
@@ -33,12 +34,15 @@ from streamfeat.mcap_records import (
 )
 from streamfeat.messages import LabelMessage
 from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.samples import Sample, complete_samples
 
 __all__ = [
     "HELD_OUT_SPLITS",
+    "WHOLE",
     "Label",
     "Losses",
     "Packet",
+    "Part",
     "Recording",
     "Sample",
     "Topic",
@@ -46,8 +50,9 @@ __all__ = [
 ]
 
 _LOOP_GAP_US = 1_000_000
-_MOST_OPEN_SAMPLES = 16
-"""Each holds its events, so labels without end would hold the recording once for each of them."""
+
+_PART_BYTES = 1 << 20
+_MOST_PARTS = 1000
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
@@ -63,33 +68,20 @@ class Topic:
     n_messages: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """A label, its events in stored order, and the resolution of the packet that brought the first."""
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Some chunks of a recording, from byte `start` to byte `end`.
 
-    label: Label
-    events: Events
-    resolution: Resolution
+    Where there are labels it begins with the first in those chunks and reaches to the first behind them, so
+    that the parts of a recording hold each label and its events once, whichever chunk these are in.
+    """
+
+    start: int
+    end: float
 
 
-@dataclass(slots=True)
-class _PendingSample:
-    """A sample whose end has not been reached."""
-
-    label: Label
-    parts: list[Events] = field(default_factory=list)
-    resolution: Resolution | None = None
-
-    def add(self, packet: Packet) -> None:
-        t = packet.events["t"]
-        inside = packet.events[(t >= self.label.start_us) & (t < _end_us(self.label))]
-        if len(inside):
-            self.parts.append(inside)
-            self.resolution = self.resolution or packet.resolution
-
-    def finish(self, default: Resolution) -> Sample:
-        events = np.concatenate([np.zeros(0, EVENT_DTYPE), *self.parts])
-        return Sample(self.label, events, self.resolution or default)
+WHOLE = Part(0, math.inf)
+"""All of a recording."""
 
 
 @dataclass(slots=True)
@@ -141,9 +133,10 @@ class Recording:
     encoding: str
     losses: Losses
 
-    def __init__(self, path: str | PathLike[str], topic: str | None = None) -> None:
+    def __init__(self, path: str | PathLike[str], topic: str | None = None, part: Part = WHOLE) -> None:
         """See `open_recording`."""
         self.path = Path(path)
+        self._part = part
         self._file = open_mcap(self.path)
         try:
             summary = read_summary(self._file)
@@ -181,12 +174,54 @@ class Recording:
             if isinstance(item, Packet) and len(item.events):
                 yield item.events
 
+    @property
+    def is_labelled(self) -> bool:
+        """Whether there may be labels."""
+        return any(topic.schema == LabelMessage.SCHEMA_NAME for topic in self.topics)
+
+    def parts(self) -> list[Part]:
+        """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
+
+        They depend on the file alone. There is but one where the file does not tell where its chunks are, or
+        where packets cannot be read without those before them (evt3).
+        """
+        starts = sorted(self._known.chunk_starts) if self.encoding != "evt3" else []
+        cuts = [0]
+        for start in starts:
+            if start >= cuts[-1] + max(_PART_BYTES, starts[-1] // _MOST_PARTS):
+                cuts.append(start)
+        return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
+
+    def part(self, part: Part) -> Callable[[], "Recording"]:
+        """What opens some of this recording, and can be pickled."""
+        return partial(Recording, self.path, self.topic, part)
+
     def items(self) -> Iterator[Packet | Label]:
         """Yield packets and labels in stored order; a label comes before its first packet."""
+        is_labelled = self.is_labelled
+        has_begun = self._part.start == 0 or not is_labelled
+        for at, item in self.placed_items(self._part):
+            is_cut = isinstance(item, Label) or not is_labelled
+            if at >= self._part.end and is_cut:
+                return
+            has_begun = has_begun or is_cut
+            if has_begun:
+                yield item
+
+    def placed_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
+        """Yield packets and labels in stored order, each with the byte of its chunk, to the end of the file.
+
+        Args:
+            part: where to begin; what is lost behind it is not counted.
+        """
         losses = self.losses = Losses()
         reader = PacketReader(self.topic)
         seen: Counter[int] = Counter()
-        for at, channel, schema, message in iter_messages(self._file, self._known, losses):
+        for at, channel, schema, message in iter_messages(
+            self._file, self._known, losses, part.start, part.end
+        ):
+            if at >= part.end:
+                losses = Losses()
             is_label = schema.name == LabelMessage.SCHEMA_NAME
             if not is_label and (channel.topic != self.topic or schema.name not in EVENT_SCHEMAS):
                 continue
@@ -203,8 +238,9 @@ class Recording:
                 where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
                 losses.add("bad label" if is_label else "bad packet", len(message.data), where)
             else:
-                yield item
-        for channel_id, channel in self._known.channels.items() if self._has_summary else ():
+                yield at, item
+        promised = self._known.channels if self._has_summary and part == WHOLE else {}
+        for channel_id, channel in promised.items():
             kind = self._known.schemas.get(channel.schema_id)
             if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
                 count_missing(self._known, channel_id, seen[channel_id], losses)
@@ -240,25 +276,11 @@ class Recording:
                     yield replace(item, start_us=item.start_us + shift_us)
 
     def samples(self) -> Iterator[Sample]:
-        """Yield the labelled samples in stored order, with memory bounded by those open at a time.
+        """Yield the labelled samples in stored order; those of a part to their end, wherever that is.
 
-        A sample is complete when a packet starts, or a label begins, at or after its end; or when 16 more
-        have begun before its end.
+        When a sample is complete, and what memory that takes: see `complete_samples`.
         """
-        pending: list[_PendingSample] = []
-        for item in self.items():
-            now = item.start_us if isinstance(item, Label) else _start_us(item)
-            while now is not None and pending and now >= _end_us(pending[0].label):
-                yield pending.pop(0).finish(self.resolution)
-            if isinstance(item, Label):
-                if len(pending) == _MOST_OPEN_SAMPLES:
-                    yield pending.pop(0).finish(self.resolution)
-                pending.append(_PendingSample(item))
-            else:
-                for sample in pending:
-                    sample.add(item)
-        for sample in pending:
-            yield sample.finish(self.resolution)
+        return complete_samples(self.placed_items(self._part), self._part.end, self.resolution)
 
     @cached_property
     def _totals(self) -> _Totals:
@@ -312,7 +334,7 @@ class Recording:
             raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
 
     def _first_packet(self) -> Packet:
-        for item in self.items():
+        for _, item in self.placed_items(WHOLE):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
@@ -352,11 +374,3 @@ def _choose_topic(path: Path, topics: list[Topic], wanted: str | None) -> str:
     if wanted is not None and wanted not in names:
         raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
     return wanted or names[0]
-
-
-def _start_us(packet: Packet) -> int | None:
-    return int(packet.events["t"].min()) if len(packet.events) else None
-
-
-def _end_us(label: Label) -> int:
-    return label.start_us + label.duration_us

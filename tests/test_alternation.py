@@ -1,5 +1,6 @@
 """What both learners share: seeds, stopping, interruption and resumption, chunks, refusals."""
 
+import itertools
 import tracemalloc
 
 import numpy as np
@@ -9,7 +10,7 @@ from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from streamfeat.errors import InputError
-from streamfeat.learn.chunks import LazyVolumes
+from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
 from streamfeat.learn.transform import TransformLearner
 from streamfeat.learn.whitening import VolumeWhitener
@@ -54,16 +55,15 @@ def test_learning_stops_when_little_is_gained(learner):
 
 
 class Interruption:
-    """Volumes during whose reading Ctrl-C comes."""
+    """Ctrl-C, when volumes are made for the so-manieth time."""
 
-    def __init__(self, volumes, reads):
-        self.volumes, self.reads, self.shape = volumes, reads, volumes.shape
+    def __init__(self, times):
+        self.left = itertools.count(times, -1)
 
-    def __getitem__(self, rows):
-        self.reads -= 1
-        if self.reads < 0:
+    def __call__(self, rows):
+        if next(self.left) < 0:
             raise KeyboardInterrupt
-        return self.volumes[rows]
+        return rows
 
 
 @learners
@@ -72,14 +72,14 @@ def test_an_interruption_keeps_the_last_whole_iteration(learner):
     three = clone(learner).set_params(max_iter=3).fit(white)
     # One pass for the lengths, one read for the start, for the transform one pass for its moments.
     passes = (2 if isinstance(learner, TransformLearner) else 1) * 4 + 1
-    late = LazyVolumes(Interruption(white, passes + 3 * 4 + 2), lambda rows: rows)
-    found = clone(learner).set_params(max_iter=50, chunk_size=100).fit(late)
+    an_iteration = 4 if isinstance(learner, TransformLearner) else 8
+    late = ChunkedVolumes(white, 100, Interruption(passes + 3 * an_iteration + 2))
+    found = clone(learner).set_params(max_iter=50).fit(late)
     assert found.interrupted_
     assert found.n_iter_ == 3
     assert np.allclose(found.components_, three.components_, atol=1e-3)
     assert found.transform(white).shape == (400, 15)
-    at_once = LazyVolumes(Interruption(white, passes + 2), lambda rows: rows)
-    found = clone(learner).set_params(chunk_size=100).fit(at_once)
+    found = clone(learner).fit(ChunkedVolumes(white, 100, Interruption(passes + 2)))
     assert (found.interrupted_, found.n_iter_, len(found.objective_)) == (True, 0, 0)
 
 
@@ -120,7 +120,7 @@ def test_what_volumes_come_in_makes_no_difference(learner, tmp_path):
     np.save(tmp_path / "white.npy", white)
     expected = clone(learner).set_params(max_iter=3).fit(white).components_
     mapped = np.load(tmp_path / "white.npy", mmap_mode="r")
-    for volumes in (mapped, white.astype(np.float64), LazyVolumes(white, lambda rows: rows)):
+    for volumes in (mapped, white.astype(np.float64), ChunkedVolumes(white)):
         found = clone(learner).set_params(max_iter=3).fit(volumes)
         assert np.array_equal(found.components_, expected)
     in_chunks = clone(learner).set_params(max_iter=3, chunk_size=33).fit(white)
@@ -132,10 +132,10 @@ def test_no_float_copy_of_all_volumes_is_made(learner):
     n, d = 40_000, 24
     counts = np.random.default_rng(0).integers(-1, 2, (n, d)).astype(np.int8)
     whitener = VolumeWhitener().fit(counts[:5000])
-    volumes = LazyVolumes(counts, whitener.transform)
+    volumes = ChunkedVolumes(counts, 500, whitener.transform)
     # A high threshold: codes that are not zero are kept from one iteration to the next.
-    make = clone(learner).set_params(max_iter=2, chunk_size=500, threshold=3.0)
-    make.fit(LazyVolumes(counts[:500], whitener.transform))  # compiled before it is measured
+    make = clone(learner).set_params(max_iter=2, threshold=3.0)
+    make.fit(ChunkedVolumes(counts[:500], 500, whitener.transform))  # compiled before it is measured
     tracemalloc.start()
     make.fit(volumes)
     peak = tracemalloc.get_traced_memory()[1]

@@ -29,7 +29,7 @@ from streamfeat.evaluate.run import StateFile, evaluate, state_path
 from streamfeat.evaluate.splits import DataSet, Fold
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
-from streamfeat.learn.chunks import LazyVolumes
+from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.volumes import windows_of
 from streamfeat.machine import PeakMemory
 from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
@@ -313,7 +313,7 @@ def test_spherical_means_find_the_directions_of_the_data():
     directions = np.linalg.qr(rng.standard_normal((20, 4)))[0].T
     x = directions[rng.integers(0, 4, 2000)] * rng.choice([-3, 3], (2000, 1))
     x = x + 0.05 * rng.standard_normal(x.shape)
-    found = spherical_means(LazyVolumes(x.astype(np.float32), lambda rows: rows), 12, rng)
+    found = spherical_means(ChunkedVolumes(x.astype(np.float32)), 12, rng)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
     assert (np.abs(found @ directions.T).max(axis=0) > 0.95).all()
 
@@ -531,9 +531,9 @@ def test_an_interrupted_run_goes_on(animals, tmp_path):
 def test_cells_that_differ_in_training_only_share_their_features(animals, monkeypatch):
     made = []
 
-    def make(method, recordings, setting, report):
+    def make(method, recordings, setting, *rest):
         made.append((method, setting))
-        return make_features(method, recordings, setting, report)
+        return make_features(method, recordings, setting, *rest)
 
     monkeypatch.setattr(cell_module, "make_features", make)
     sweeps = [parse_sweep("mirror=no,yes"), parse_sweep("filters=6,12")]

@@ -1,10 +1,14 @@
 """Learning: whitening, fair samples of volumes, and the steps from recordings to an encoder."""
 
 import tracemalloc
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import tiny
+from hypothesis import given
+from hypothesis import strategies as st
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from streamfeat.encoder import Encoder
@@ -13,7 +17,7 @@ from streamfeat.events import make_events
 from streamfeat.geometry import Geometry
 from streamfeat.learn.fit import geometry_of, learn_encoder
 from streamfeat.learn.setting import DEFAULTS, PRESETS, THRESHOLDS, Setting, preset_with
-from streamfeat.learn.volumes import Window, sample_volumes, windows_of
+from streamfeat.learn.volumes import Volumes, Window, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recording import Label, open_recording
 
@@ -87,6 +91,7 @@ def test_whitening_refuses_what_has_no_covariance(volumes, reason):
 
 # --- volumes
 
+SEED = (7, 0)
 POINT = Geometry(patch=1, stride=1, n_bins=1, bin_us=1000, max_count=1000)
 
 
@@ -102,21 +107,20 @@ def test_volumes_of_a_known_stream():
     events = make_events(
         [0, 1, 1, 1, 1, 0, 0], [0, 0, 1, 1, 1, 1, 1], [1, 0, 1, 1, 1, 0, 1], [*range(0, 140, 20)]
     )
-    found = sample_volumes([Window(events, (2, 2), 0, 199)], geometry, 3, np.random.default_rng(0))
+    found = sample_volumes([Window(events, (2, 2), 0, 199)], geometry, 3, SEED)
     # Bin by bin, row by row; three ON events are clipped to two; the last two fall into the second bin.
     expected = [1, -1, 0, 2, 0, 0, 0, 0]
     expected[6] += -1 + 1
     assert found.counts.tolist() == [expected] * 3
     assert found.counts.dtype == np.int8
-    assert sample_volumes([window(3)], POINT, 1, np.random.default_rng(0)).counts.dtype == np.int16
+    assert sample_volumes([window(3)], POINT, 1, SEED).counts.dtype == np.int16
     assert (found.empty_share, found.windows) == (0.0, 1)
 
 
 def test_windows_have_equal_chances():
     counts = np.zeros(11)
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        found = sample_volumes((window(v) for v in range(1, 11)), POINT, 40, rng, per_window=16)
+    for seed in range(60):
+        found = sample_volumes((window(v) for v in range(1, 11)), POINT, 40, (seed,), per_window=16)
         assert len(found.counts) == 40
         counts += np.bincount(found.counts[:, 0], minlength=11)
     # 2,400 draws, 240 expected of each window; one in 10,000 for a chi square of 33.7 with 9 degrees.
@@ -126,26 +130,46 @@ def test_windows_have_equal_chances():
 def test_places_have_equal_chances():
     y, x = np.divmod(np.arange(6), 3)
     events = make_events(np.repeat(x, y * 3 + x + 1), np.repeat(y, y * 3 + x + 1), 1, np.zeros(21, np.int64))
-    windows = [Window(events, (2, 3), 0, 999)] * 40
-    found = sample_volumes(windows, POINT, 10_000, np.random.default_rng(0), per_window=60)
+    windows = []
+    for origin in range(0, 40_000, 1000):
+        moved = events.copy()
+        moved["t"] += origin
+        windows.append(Window(moved, (2, 3), origin, origin + 999))
+    found = sample_volumes(windows, POINT, 10_000, SEED, per_window=60)
     counts = np.bincount(found.counts[:, 0], minlength=7)[1:]
     assert counts.sum() == 2400
     assert np.square(counts - 400).sum() / 400 < 25.7
 
 
 def test_empty_places_are_drawn_again_and_counted():
-    windows = [window(3, shape=(4, 4), n=4)] * 50
-    found = sample_volumes(windows, POINT, 10_000, np.random.default_rng(0), per_window=8)
-    assert (found.counts == 3).all()
+    windows = [window(v, shape=(4, 4), n=4) for v in range(1, 51)]
+    found = sample_volumes(windows, POINT, 10_000, SEED, per_window=8)
+    assert found.counts.min() == 1
     assert found.empty_share == pytest.approx(0.75, abs=0.04)
 
 
 def test_too_small_windows_are_passed_over():
     geometry = Geometry(patch=3, stride=1, n_bins=1, bin_us=1000)
-    with pytest.raises(InputError, match=r"no local volume of 3x3 .* 0 windows"):
-        sample_volumes([window(1, shape=(2, 9))], geometry, 5, np.random.default_rng(0))
-    with pytest.raises(InputError, match="1 windows"):
-        sample_volumes([window(1, shape=(9, 9), n=0)], geometry, 5, np.random.default_rng(0))
+    found = sample_volumes([window(1, shape=(2, 9))], geometry, 5, SEED)
+    assert (found.counts.shape, found.windows, found.empty_share) == ((0, 9), 0, 0.0)
+    found = sample_volumes([window(1, shape=(9, 9), n=0)], geometry, 5, SEED)
+    assert (found.counts.shape, found.windows, found.empty_share) == ((0, 9), 1, 1.0)
+
+
+@given(st.data())
+def test_a_sample_is_the_same_in_however_many_parts(data):
+    n = data.draw(st.integers(1, 60))
+    windows = [replace(window(v), origin_us=-v, last_us=999 - v) for v in range(1, 20)]
+    whole = sample_volumes(windows, POINT, n, SEED, per_window=8)
+    cut = sorted(data.draw(st.lists(st.integers(0, 19), max_size=4)))
+    parts = [sample_volumes(windows[a:b], POINT, n, SEED, per_window=8) for a, b in pairwise([0, *cut, 19])]
+    found = Volumes.none(POINT).with_others(data.draw(st.permutations(parts)), n)
+    assert np.array_equal(found.keys, whole.keys)
+    assert np.array_equal(found.counts, whole.counts)
+    assert (found.drawn, found.empty, found.windows) == (whole.drawn, whole.empty, whole.windows)
+    limit = int(whole.keys[-1]) + 1
+    below = sample_volumes(windows, POINT, n, SEED, per_window=8, limit=limit)
+    assert np.array_equal(below.keys, whole.keys)
 
 
 def test_windows_of_labelled_items():

@@ -21,7 +21,7 @@ from streamfeat.events import make_events
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.packets import PacketWriter
 from streamfeat.recorder import RecordingWriter, recover
-from streamfeat.recording import Label, Packet, Topic, open_recording
+from streamfeat.recording import WHOLE, Label, Packet, Topic, open_recording
 
 RESOLUTION = (60, 80)
 LABEL = Label(1_000, 400_000, "car", "train", "a.dat")
@@ -179,8 +179,9 @@ def test_samples_arrive_as_soon_as_the_next_begins(tmp_path, monkeypatch):
             writer.write_label(Label(i * 100, 100, str(i)))
             writer.write_events(make_events([1, 2], 0, 1, [i * 100, i * 100 + 100]), RESOLUTION)
     with open_recording(tmp_path / "a.mcap") as recording:
-        items, taken = recording.items(), []
-        monkeypatch.setattr(recording, "items", lambda: (taken.append(item) or item for item in items))
+        items, taken = recording.placed_items(WHOLE), []
+        taking = ((at, taken.append(item) or item) for at, item in items)
+        monkeypatch.setattr(recording, "placed_items", lambda part: taking)
         sample = next(recording.samples())
     assert (sample.label.label, sample.events["t"].tolist()) == ("0", [0])
     assert [type(item) for item in taken] == [Label, Packet, Label]

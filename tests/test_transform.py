@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 
-from streamfeat.learn.chunks import squared_lengths
 from streamfeat.learn.initial import random_directions
 from streamfeat.learn.omega import Omega, condition_number, mutual_coherence
 from streamfeat.learn.transform import TransformLearner, _closed_form, _positive_root, _Quadratic, _update
@@ -38,7 +37,7 @@ def moment_of(white, conditioning=0.0):
 
 def problem_of(white, k, *, threshold=0.4, seed=0, conditioning=0.0, **omega):
     """The transform half-step that follows the first codes, with the transform that those are of."""
-    start = random_directions(white, squared_lengths(white, 100), k, np.random.RandomState(seed))
+    start = random_directions(white, np.square(white).sum(axis=1), k, np.random.RandomState(seed))
     z = white @ start.T
     codes = z - z.clip(-threshold, threshold)
     cross = (codes.T @ white / len(white)).astype(float)
@@ -179,7 +178,7 @@ def test_coherence_alone_does_not_stall(coherence):
     codes = learner.transform(white)
     cross = codes.T @ white / len(white)
     problem = _Quadratic(moment_of(white), cross, Omega(coherence=coherence))
-    start = random_directions(white, squared_lengths(white, 99), D + 9, np.random.RandomState(0)).astype(
+    start = random_directions(white, np.square(white).sum(axis=1), D + 9, np.random.RandomState(0)).astype(
         float
     )
     assert np.linalg.norm(problem.gradient(rows)) < 0.02 * np.linalg.norm(problem.gradient(start))

@@ -18,6 +18,7 @@ from streamfeat.evaluate.splits import DataSet
 from streamfeat.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.machine import PeakMemory
 from streamfeat.recording import Recording, Sample
+from streamfeat.workers import HERE, Workers
 
 __all__ = ["run_cells"]
 
@@ -25,7 +26,7 @@ _SHOWN_FILTERS = 48
 
 
 def run_cells(
-    data: DataSet, cells: Sequence[Cell], report: Report, *, early_samples: int
+    data: DataSet, cells: Sequence[Cell], report: Report, *, early_samples: int, workers: Workers = HERE
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells that the same features serve; results are JSON values.
 
@@ -36,6 +37,7 @@ def run_cells(
         cells: what to run; features are made once.
         report: told about progress.
         early_samples: held-out samples for early decision; none if 0.
+        workers: learn and encode; see `make_features`.
 
     Yields:
         each cell and its result as soon as it is done.
@@ -47,14 +49,18 @@ def run_cells(
     with data.open(cell.fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
-            features = make_features(cell.method, recordings, cell.setting, report)
+            features = make_features(cell.method, recordings, cell.setting, report, workers)
             learned = time.perf_counter()
             _compile(features, recordings)
             compiled = time.perf_counter()
-            samples = encode_recordings(features, recordings, report)
+            samples = encode_recordings(features, recordings, report, workers=workers)
             encoded = time.perf_counter()
             wanted = any(cell.setting.mirror for cell in cells)
-            images = encode_recordings(features, recordings, report, mirror=True) if wanted else None
+            images = (
+                encode_recordings(features, recordings, report, mirror=True, workers=workers)
+                if wanted
+                else None
+            )
             all_encoded = time.perf_counter()
         for cell in cells:
             with PeakMemory() as training:

@@ -11,21 +11,24 @@ from numpy.typing import NDArray
 
 from streamfeat.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
-from streamfeat.learn.chunks import LazyVolumes, chunks
+from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.fit import learn_encoder, prepare
 from streamfeat.learn.setting import Setting
 from streamfeat.recording import Recording
+from streamfeat.workers import HERE, Sums, Workers
 
 __all__ = ["make_features", "random_filters", "spherical_means"]
 
 Report = Callable[[str, int, int, str], None]
 """Called with (step, done, of how many, remark)."""
 
-_CHUNK = 4096
-
 
 def make_features(
-    method: str, recordings: Sequence[Recording], setting: Setting, report: Report
+    method: str,
+    recordings: Sequence[Recording],
+    setting: Setting,
+    report: Report,
+    workers: Workers = HERE,
 ) -> FeatureMap:
     """Learn what a method learns, from samples that are not held out.
 
@@ -34,6 +37,7 @@ def make_features(
         recordings: open recordings.
         setting: of that method, as in `plan.Cell`.
         report: told about progress.
+        workers: read and learn filters; the methods without filters are fitted here.
 
     Raises:
         InputError: there is too little to learn from.
@@ -46,16 +50,18 @@ def make_features(
     if method == "hots":
         return SurfaceHistogram.fitted(recordings, seed=setting.seed)
     if method in ("kmeans", "random"):
-        return _other_filters(method, recordings, setting, report)
-    encoder = learn_encoder(recordings, setting, report=report)
+        return _other_filters(method, recordings, setting, report, workers)
+    encoder = learn_encoder(recordings, setting, report=report, workers=workers)
     if encoder.provenance["interrupted"]:  # an encoder of fewer iterations is not what was asked for
         raise KeyboardInterrupt
     return encoder
 
 
-def _other_filters(method: str, recordings: Sequence[Recording], setting: Setting, report: Report) -> Encoder:
+def _other_filters(
+    method: str, recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers
+) -> Encoder:
     """The pipeline of the direct formulation, with filters that solve another problem, or none."""
-    material = prepare(recordings, setting, report)
+    material = prepare(recordings, setting, report, workers)
     rng = np.random.default_rng([setting.seed, 1])  # volumes were drawn from the seed alone
     if method == "random":
         return material.encoder(random_filters(setting.filters, material.geometry.entries, rng))
@@ -69,7 +75,7 @@ def random_filters(n: int, entries: int, rng: np.random.Generator) -> NDArray[np
 
 
 def spherical_means(
-    volumes: LazyVolumes,
+    volumes: ChunkedVolumes,
     n: int,
     rng: np.random.Generator,
     *,
@@ -90,14 +96,18 @@ def spherical_means(
     """
     filters = random_filters(n, volumes.shape[1], rng)
     for iteration in range(iterations):
-        totals = filters.copy()
-        for _, chunk in chunks(volumes, _CHUNK):
-            likeness = chunk @ filters.T
-            best = np.abs(likeness).argmax(axis=1)
-            codes = np.zeros_like(likeness)
-            rows = np.arange(len(chunk))
-            codes[rows, best] = likeness[rows, best]
-            totals += codes.T @ chunk
-        filters = totals / np.linalg.norm(totals, axis=1, keepdims=True)
+        (totals,) = volumes.total(_nearest_sums, filters)
+        totals += filters
+        filters = np.asarray(totals / np.linalg.norm(totals, axis=1, keepdims=True), np.float32)
         report("learning", iteration + 1, iterations, "spherical k-means")
     return filters
+
+
+def _nearest_sums(chunk: NDArray[np.float32], filters: NDArray[np.float32]) -> Sums:
+    """The chunk's part of `S X'`."""
+    likeness = chunk @ filters.T
+    best = np.abs(likeness).argmax(axis=1)
+    codes = np.zeros_like(likeness)
+    rows = np.arange(len(chunk))
+    codes[rows, best] = likeness[rows, best]
+    return ((codes.T @ chunk).astype(np.float64),)

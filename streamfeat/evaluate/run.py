@@ -27,6 +27,7 @@ from streamfeat.evaluate.scores import (
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files import write_atomically
 from streamfeat.machine import describe_machine
+from streamfeat.workers import HERE, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
@@ -124,6 +125,7 @@ def evaluate(
     state: Path | None = None,
     report: Report = lambda step, done, total, remark: None,
     finished: Callable[[dict[str, Any]], None] = lambda row: None,
+    workers: Workers = HERE,
 ) -> dict[str, Any]:
     """Run all cells that are not done, and add up the result (JSON values).
 
@@ -134,6 +136,7 @@ def evaluate(
         state: file of finished cells, read and written.
         report: told about progress.
         finished: called with each row of the result when its last fold is done.
+        workers: learn and encode.
 
     Raises:
         InputError: see `run_cells` and `StateFile`.
@@ -156,7 +159,9 @@ def evaluate(
             for other in cells[i:]:
                 if other.has_features_of(cell) and kept.get(other) is None:
                     alike.setdefault(_name(other.key), other)
-            for one, result in run_cells(data, [*alike.values()], report, early_samples=early_samples):
+            for one, result in run_cells(
+                data, [*alike.values()], report, early_samples=early_samples, workers=workers
+            ):
                 kept.add(one, result)
         if cell.fold == data.n_folds - 1:
             rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)]))

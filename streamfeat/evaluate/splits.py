@@ -7,15 +7,16 @@ Not here: learning and scoring.
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
 from streamfeat.errors import InputError
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet, Recording, open_recording
+from streamfeat.recording import HELD_OUT_SPLITS, WHOLE, Label, Packet, Part, Recording, open_recording
 
 __all__ = ["DataSet", "Fold"]
 
@@ -26,31 +27,36 @@ class Fold(Recording):
     Args:
         path: the file.
         topic: as for `open_recording`.
-        held_out: positions of the labels that are, among those that are there.
+        held_out: the labels that are.
+        part: as for `Recording`.
     """
 
-    def __init__(self, path: Path, topic: str | None, held_out: frozenset[int] = frozenset()) -> None:
+    def __init__(
+        self, path: Path, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
+    ) -> None:
         """Open it."""
         self._held_out = held_out
-        super().__init__(path, topic)
+        super().__init__(path, topic, part)
 
-    def items(self) -> Iterator[Packet | Label]:
+    def part(self, part: Part) -> Callable[[], Recording]:
+        """See `Recording`."""
+        return partial(Fold, self.path, self.topic, self._held_out, part)
+
+    def placed_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
         """As those of the recording, with other splits, and without a held-out label and its events."""
-        position = 0
         left_out: Label | None = None
-        for item in super().items():
+        for at, item in super().placed_items(part):
             if isinstance(item, Label):
                 left_out = item if item.split in HELD_OUT_SPLITS else None
                 if left_out is None:
-                    yield replace(item, split="test" if position in self._held_out else "train")
-                    position += 1
+                    yield at, replace(item, split="test" if item in self._held_out else "train")
             elif left_out is None:
-                yield item
+                yield at, item
             else:
                 t = item.events["t"] - left_out.start_us
                 outside = (t < 0) | (t >= left_out.duration_us)
                 if outside.any():
-                    yield replace(item, events=item.events[outside])
+                    yield at, replace(item, events=item.events[outside])
 
 
 class DataSet:
@@ -103,7 +109,7 @@ class DataSet:
             raise InputError(
                 f"{where}: every sample is of a held-out split; nothing to learn from, add training samples"
             )
-        self._folds: list[list[frozenset[int]]] = []
+        self._folds: list[list[frozenset[Label]]] = []
         if any(held_out) and on == "held-out":
             self.scored, self.n_folds = "the recording's held-out split", 1
             return
@@ -130,7 +136,7 @@ class DataSet:
         splitter = StratifiedKFold(folds, shuffle=True, random_state=seed)
         self._folds = [
             [
-                frozenset((test[(test >= start) & (test < stop)] - start).tolist())
+                frozenset(every[i] for i in test[(test >= start) & (test < stop)])
                 for start, stop in itertools.pairwise(cuts)
             ]
             for _, test in splitter.split(targets, targets)

@@ -16,7 +16,7 @@ bin, because a volume that enters a plane has its response computed afresh.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from streamfeat.kernels.compiled import inlined, kernel
@@ -299,7 +299,7 @@ def fix_atoms(atoms: NDArray[np.float64], operator: Operator, code: NDArray[np.i
     code[atoms.shape[0] :] = 0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def solve_lasso_rows(
     right: NDArray[np.float32],
     squares: NDArray[np.float64],
@@ -318,15 +318,13 @@ def solve_lasso_rows(
         gap: relative duality gap.
         codes: `(n, K)`, overwritten.
     """
-    n, n_atoms = codes.shape
-    blocks = 64
+    n_atoms = codes.shape[1]
     padded = -(-n_atoms // LANES) * LANES
-    for block in prange(blocks):
-        wide, kept, work = np.empty(n_atoms), np.empty((2, n_atoms)), np.empty((4, padded))
-        chosen, corners = np.empty(n_atoms, np.int64), np.empty(n_atoms * padded, np.float32)
-        for i in range(n * block // blocks, n * (block + 1) // blocks):
-            kept[CODE] = codes[i]
-            respond(gram, kept, work, chosen)
-            wide[:] = right[i]
-            solve_lasso(wide, squares[i], penalty, gram, gap, kept, work, chosen, corners)
-            codes[i] = kept[CODE]
+    wide, kept, work = np.empty(n_atoms), np.empty((2, n_atoms)), np.empty((4, padded))
+    chosen, corners = np.empty(n_atoms, np.int64), np.empty(n_atoms * padded, np.float32)
+    for i in range(codes.shape[0]):
+        kept[CODE] = codes[i]
+        respond(gram, kept, work, chosen)
+        wide[:] = right[i]
+        solve_lasso(wide, squares[i], penalty, gram, gap, kept, work, chosen, corners)
+        codes[i] = kept[CODE]

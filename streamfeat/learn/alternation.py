@@ -15,7 +15,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils import check_random_state
 
 from streamfeat.errors import InputError
-from streamfeat.learn.chunks import LazyVolumes, Rows, checked_rows, squared_lengths
+from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.initial import random_directions
 from streamfeat.learn.omega import condition_number, mutual_coherence
 
@@ -40,7 +40,7 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     Args:
         max_iter: iterations at most, each of two half-steps.
         tol: stop when an iteration lowers the objective by less than this share.
-        chunk_size: volumes whose codes are held as floats at a time.
+        chunk_size: volumes whose codes are held as floats at a time by each thread.
         warm_start: start from `components_` of the fit before.
         random_state: seed of the initial rows.
         progress: called with (iteration, objective) after each iteration, whose attributes are there then.
@@ -53,8 +53,11 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     random_state: int | None = None
     progress: Callable[[int, float], None] | None = None
 
-    def fit(self, X: ArrayLike | LazyVolumes, y: Any = None) -> Self:
-        """Learn from `(n, d)` whitened volumes: an array, a memory map, or `LazyVolumes`; not changed.
+    def fit(self, X: ArrayLike | ChunkedVolumes, y: Any = None) -> Self:
+        """Learn from `(n, d)` whitened volumes: an array, a memory map, or `ChunkedVolumes`; not changed.
+
+        What is learned has the same bits on one core, on many, and on the workers of a cluster, as far as
+        their processors round alike.
 
         Ctrl-C ends learning, not the program: what the last whole iteration found is kept, and
         `interrupted_` is true.
@@ -63,9 +66,10 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             InputError: a parameter is out of range, there are fewer volumes than rows to learn, a value is
                 not finite, or all volumes are constant.
         """
-        volumes = checked_rows(self, X)
+        self._check_numbers()
+        volumes = checked_volumes(self, X, self.chunk_size)
         self._check(volumes.shape[0])
-        squares = squared_lengths(volumes, self.chunk_size)
+        squares = volumes.squared_lengths()
         rows = self._first_rows(volumes, squares)
         objective: list[float] = []
         condition: list[float] = []
@@ -102,21 +106,24 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self.coherence_ = np.array(coherence)
         self.n_iter_ = len(condition)
 
-    def _check(self, n_volumes: int) -> None:
-        """Refuse parameters that cannot be used; subclasses check theirs as well."""
+    def _check_numbers(self) -> None:
         k = self._n_rows
         if k < 1 or self.max_iter < 1 or self.chunk_size < 1:
             raise InputError(
                 f"K is {k}, max_iter {self.max_iter} and chunk_size {self.chunk_size}; "
                 "each must be at least one"
             )
+
+    def _check(self, n_volumes: int) -> None:
+        """Refuse parameters that cannot be used; subclasses check theirs as well."""
+        k = self._n_rows
         if n_volumes < max(k, 2):
             raise InputError(
                 f"n_samples = {n_volumes} is too few volumes to learn K = {k} from; "
                 f"give at least {max(k, 2)}, or lower K"
             )
 
-    def _first_rows(self, volumes: Rows, squares: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _first_rows(self, volumes: ChunkedVolumes, squares: NDArray[np.float64]) -> NDArray[np.float32]:
         """Initial rows, or those of the fit before."""
         shape = self._n_rows, volumes.shape[1]
         if not (self.warm_start and hasattr(self, "components_")):
@@ -135,7 +142,7 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         raise NotImplementedError
 
     def _alternate(
-        self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
+        self, volumes: ChunkedVolumes, squares: NDArray[np.float64], rows: NDArray[np.float32]
     ) -> Iterator[Step]:
         """Iterate without end.
 

@@ -15,8 +15,9 @@ from sklearn.utils.validation import check_is_fitted
 from streamfeat.errors import InputError
 from streamfeat.kernels.lasso import solve_lasso_rows
 from streamfeat.learn.alternation import Alternation, Step
-from streamfeat.learn.chunks import LazyVolumes, Rows, checked_rows, chunks, squared_lengths
+from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.omega import Omega
+from streamfeat.workers import Sums
 
 __all__ = ["DictionaryLearner"]
 
@@ -68,8 +69,9 @@ class DictionaryLearner(Alternation):
     No half-step raises the objective. After an iteration an atom that no volume uses becomes the volume that
     is represented worst, which does not touch fit and codes, but may raise the coherence term.
 
-    State: at most `4 K^2 + 5 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, for each
-    volume 16 bytes and for each code that is not zero 8, from which the next lasso starts.
+    State: at most `4 K^2 + 5 K d` float64, for each thread that works `2 K^2 + 2 K d` more and for each of
+    `chunk_size` volumes `3 K + d` float32, for each volume 16 bytes and for each code that is not zero 8,
+    from which the next lasso starts.
 
     Args:
         n_atoms: `K`.
@@ -101,18 +103,12 @@ class DictionaryLearner(Alternation):
     gap: float = 1e-3
     tol: float = 1e-3
 
-    def transform(self, X: ArrayLike | LazyVolumes) -> NDArray[np.float32]:
+    def transform(self, X: ArrayLike | ChunkedVolumes) -> NDArray[np.float32]:
         """Lasso codes `(n, K)` of `(n, d)` whitened volumes."""
         check_is_fitted(self)
-        volumes = checked_rows(self, X, reset=False)
-        squares = squared_lengths(volumes, self.chunk_size)
-        codes = np.zeros((volumes.shape[0], len(self.components_)), np.float32)
-        gram = _inner_products(self.components_)
-        for where, chunk in chunks(volumes, self.chunk_size):
-            # In float64, so that a code does not depend on how many are computed with it.
-            right = (chunk.astype(np.float64) @ self.components_.T).astype(np.float32)
-            solve_lasso_rows(right, squares[where], float(self.threshold), gram, self.gap, codes[where])
-        return codes
+        volumes = checked_volumes(self, X, self.chunk_size, reset=False)
+        atoms = self.components_, _inner_products(self.components_)
+        return np.concatenate(volumes.fetch(volumes.each(_exact_codes, *atoms, self.threshold, self.gap)))
 
     @property
     def _n_rows(self) -> int:
@@ -127,16 +123,20 @@ class DictionaryLearner(Alternation):
         super()._check(n_volumes)
 
     def _alternate(
-        self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
+        self, volumes: ChunkedVolumes, squares: NDArray[np.float64], rows: NDArray[np.float32]
     ) -> Iterator[Step]:
         omega = Omega(coherence=self.coherence)
-        codes: list[Any] = []
+        codes: list[Any] | None = None
         scale = np.ones(len(rows), np.float32)
+        n = volumes.shape[0]
         energy = 0.5 * float(squares.mean())
         rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
         self.replaced_ = 0
         while True:
-            sums, errors = self._code(volumes, squares, rows, codes, scale)
+            gram = _inner_products(rows)
+            solve = _solve if codes else _solve_anew
+            codes = volumes.each(solve, rows, gram, scale, self.threshold, self.gap, beside=codes)
+            sums = _Sums(*(total / n for total in volumes.total(_code_sums, beside=codes)))
             atoms = rows.astype(np.float64)
             before = energy + sums.objective(atoms, self.threshold) + omega.value(atoms)
             scale = _sweep(atoms, sums, self.threshold, self.coherence).astype(np.float32)
@@ -147,46 +147,76 @@ class DictionaryLearner(Alternation):
             yield Step(rows, before, after)
             if len(unused):
                 rows = rows.copy()
+                errors = np.concatenate(volumes.fetch(codes, _errors))
                 self.replaced_ += _replace(rows, unused, volumes, squares, errors)
 
-    def _code(
-        self,
-        volumes: Rows,
-        squares: NDArray[np.float64],
-        rows: NDArray[np.float32],
-        codes: list[Any],
-        scale: NDArray[np.float32],
-    ) -> tuple[_Sums, NDArray[np.float64]]:
-        """One pass over the volumes: sums, and the squared error of each volume.
 
-        Args:
-            volumes: `(n, d)`.
-            squares: `(n,)` their squared lengths.
-            rows: `(K, d)` atoms.
-            codes: a sparse array for each chunk, or empty; replaced with the new codes.
-            scale: `(K,)` what the dictionary half-step did to the codes.
-        """
-        (n, d), k = volumes.shape, len(rows)
-        sums = _Sums(np.zeros((k, k)), np.zeros((k, d)), np.zeros(k))
-        errors = np.empty(n)
-        gram = _inner_products(rows)
-        solved: list[Any] = []
-        for i, (where, chunk) in enumerate(chunks(volumes, self.chunk_size)):
-            right = chunk @ rows.T
-            part = codes[i].toarray() * scale if codes else np.zeros(right.shape, np.float32)
-            solve_lasso_rows(right, squares[where], float(self.threshold), gram, self.gap, part)
-            sums.gram += part.T @ part
-            sums.cross += part.T @ chunk
-            size = np.abs(part)
-            sums.l1 += size.sum(axis=0, dtype=np.float64)
-            # At the solution l'D'(x - D l) = lambda0 |l|_1.
-            fitted = np.einsum("ik,ik->i", part, right)
-            errors[where] = squares[where] - fitted - self.threshold * size.sum(axis=1)
-            solved.append(csr_array(part))
-        codes[:] = solved
-        for total in (sums.gram, sums.cross, sums.l1):
-            total /= n
-        return sums, errors
+@dataclass(frozen=True, slots=True)
+class _Codes:
+    """Codes of a chunk, from which the next lasso starts, and the squared error of each volume, `(m,)`."""
+
+    codes: Any  # a sparse array (m, K)
+    errors: NDArray[np.float64]
+
+
+def _solve_anew(chunk: NDArray[np.float32], *common: Any) -> _Codes:
+    """Solve the lassos of a chunk from zero."""
+    return _solve(chunk, None, *common)
+
+
+def _solve(
+    chunk: NDArray[np.float32],
+    before: _Codes | None,
+    rows: NDArray[np.float32],
+    gram: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    threshold: float,
+    gap: float,
+) -> _Codes:
+    """Solve the lassos of a chunk.
+
+    Args:
+        chunk: `(m, d)` volumes.
+        before: codes to start from.
+        rows: `(K, d)` atoms.
+        gram: their inner products.
+        scale: `(K,)` what the dictionary half-step did to the codes.
+        threshold: lambda0.
+        gap: relative duality gap.
+    """
+    squares = np.square(chunk, dtype=np.float64).sum(axis=1)
+    right = chunk @ rows.T
+    codes = before.codes.toarray() * scale if before else np.zeros(right.shape, np.float32)
+    solve_lasso_rows(right, squares, float(threshold), gram, gap, codes)
+    # At the solution l'D'(x - D l) = lambda0 |l|_1.
+    fitted = np.einsum("ik,ik->i", codes, right)
+    return _Codes(csr_array(codes), squares - fitted - threshold * np.abs(codes).sum(axis=1))
+
+
+def _exact_codes(
+    chunk: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    gram: NDArray[np.float32],
+    threshold: float,
+    gap: float,
+) -> NDArray[np.float32]:
+    """Codes `(m, K)` of which each does not depend on how many are computed with it."""
+    codes = np.zeros((len(chunk), len(rows)), np.float32)
+    right = (chunk.astype(np.float64) @ rows.T).astype(np.float32)
+    squares = np.square(chunk, dtype=np.float64).sum(axis=1)
+    solve_lasso_rows(right, squares, float(threshold), gram, gap, codes)
+    return codes
+
+
+def _code_sums(chunk: NDArray[np.float32], found: _Codes) -> Sums:
+    """The chunk's part of `L L'`, `L X'` and `|l_k|`."""
+    codes = found.codes.toarray()
+    sums = codes.T @ codes, codes.T @ chunk
+    return *(total.astype(np.float64) for total in sums), np.abs(codes).sum(axis=0, dtype=np.float64)
+
+
+def _errors(found: _Codes) -> NDArray[np.float64]:
+    return found.errors
 
 
 def _inner_products(rows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -232,7 +262,7 @@ def _sweep(atoms: NDArray[np.float64], sums: _Sums, penalty: float, coherence: f
 def _replace(
     rows: NDArray[np.float32],
     unused: NDArray[np.int64],
-    volumes: Rows,
+    volumes: ChunkedVolumes,
     squares: NDArray[np.float64],
     errors: NDArray[np.float64],
 ) -> int:

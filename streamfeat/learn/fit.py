@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.geometry import Geometry
-from streamfeat.learn.chunks import LazyVolumes
+from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
 from streamfeat.learn.setting import Setting
 from streamfeat.learn.transform import TransformLearner
-from streamfeat.learn.volumes import Volumes, Window, sample_volumes, windows_of
+from streamfeat.learn.volumes import KEYS, Volumes, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
-from streamfeat.recording import HELD_OUT_SPLITS, Recording
+from streamfeat.recording import HELD_OUT_SPLITS, Label, Losses, Recording
+from streamfeat.workers import HERE, Workers
 
 __all__ = ["Material", "geometry_of", "learn_encoder", "prepare"]
 
@@ -41,7 +42,7 @@ Keep = Callable[[Callable[[], Encoder]], None]
 """Called after each iteration with a function that makes the encoder so far."""
 
 
-def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
+def geometry_of(setting: Setting, recordings: Sequence[Recording], workers: Workers = HERE) -> Geometry:
     """The geometry that a setting means for these recordings.
 
     Args:
@@ -49,6 +50,7 @@ def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
             than the window: of a sample that is a little longer, the whole oldest bin would be out of it.
             100 ms without labels.
         recordings: open recordings.
+        workers: read labels, where those are needed.
 
     Raises:
         InputError: a value is out of range.
@@ -56,7 +58,7 @@ def geometry_of(setting: Setting, recordings: Sequence[Recording]) -> Geometry:
     if setting.window_ms is not None:
         window_us = round(setting.window_ms * 1000)
     else:
-        labels = [label for recording in recordings for label in recording.labels]
+        labels = [label for found in workers.map(_labels, _openers(recordings)) for label in found]
         durations = [label.duration_us for label in labels if label.split not in HELD_OUT_SPLITS]
         window_us = int(np.quantile(durations or [100_000], _WHOLE, method="higher"))
     given = asdict(setting)
@@ -72,11 +74,8 @@ class Material:
     geometry: Geometry
     volumes: Volumes
     whitener: VolumeWhitener
-
-    @property
-    def white(self) -> LazyVolumes:
-        """Whitened volumes `(n, d)`, made a chunk at a time."""
-        return LazyVolumes(self.volumes.counts, self.whitener.transform)
+    white: ChunkedVolumes
+    """Whitened volumes `(n, d)`, made a chunk at a time."""
 
     def encoder(self, filters: NDArray[np.float32], provenance: Mapping[str, Any] | None = None) -> Encoder:
         """The encoder with these `(K, d)` filters."""
@@ -93,36 +92,86 @@ class Material:
         )
 
 
-def prepare(recordings: Sequence[Recording], setting: Setting, report: Report) -> Material:
+def prepare(
+    recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers = HERE
+) -> Material:
     """Sample volumes and learn their whitening; samples of held-out splits are not looked at.
 
-    Recordings are read once, a chunk at a time, for a sample of volumes, which is kept as small integers:
+    Recordings are read once, in parts, for a sample of volumes, which is kept as small integers:
     `volumes * d` bytes. No float copy of it is made.
 
     Args:
         recordings: open recordings.
         setting: geometry, number of volumes, seed.
         report: told about progress.
+        workers: read and compute; what comes out is the same wherever that is.
 
     Raises:
         InputError: no usable volume was found, or there are too few.
     """
-    geometry = geometry_of(setting, recordings)
-
-    def windows() -> Iterator[Window]:
-        seen = 0
-        for recording in recordings:
-            for window in windows_of(recording.items(), geometry):
-                seen += 1
-                report("reading windows", seen, 0, str(recording.path.name))
-                yield window
-
-    volumes = sample_volumes(windows(), geometry, setting.volumes, np.random.default_rng(setting.seed))
+    geometry = geometry_of(setting, recordings, workers)
+    volumes = _sample(recordings, setting, geometry, report, workers)
     remark = f"{len(volumes.counts):,} volumes, {volumes.empty_share:.1%} of places were empty"
     report("whitening", 0, 1, remark)
-    whitener = VolumeWhitener().fit(volumes.counts)
+    chunked = ChunkedVolumes(volumes.counts, workers=workers)
+    whitener = VolumeWhitener().fit(chunked)
     report("whitening", 1, 1, remark)
-    return Material(setting, geometry, volumes, whitener)
+    return Material(setting, geometry, volumes, whitener, chunked.made(whitener.transform))
+
+
+def _sample(
+    recordings: Sequence[Recording],
+    setting: Setting,
+    geometry: Geometry,
+    report: Report,
+    workers: Workers,
+) -> Volumes:
+    """A sample of all recordings; what is not of the smallest keys so far is not even sent."""
+    n = setting.volumes
+    volumes = Volumes.none(geometry)
+    parts = [*_openers(recordings)]
+    losses = [Losses() for _ in recordings]
+
+    def pieces() -> Iterator[tuple[Any, ...]]:
+        for part in parts:
+            yield *part, int(volumes.keys[-1]) if len(volumes.keys) == n else KEYS
+
+    found = workers.map(_sample_part, pieces(), geometry, n, setting.seed)
+    for done, (number, more, lost) in enumerate(found, 1):
+        volumes = volumes.with_others([more], n)
+        losses[number].add_all(lost)
+        remark = f"{recordings[number].path.name}, {volumes.windows:,} windows"
+        report("reading windows", done, len(parts), remark)
+    for recording, lost in zip(recordings, losses, strict=True):
+        recording.losses = lost
+    if len(volumes.keys) == 0:
+        raise InputError(
+            f"no local volume of {geometry.patch}x{geometry.patch} pixels with an event was found in "
+            f"{volumes.windows} windows; check the recording's resolution and splits"
+        )
+    return volumes
+
+
+def _openers(recordings: Sequence[Recording]) -> Iterator[tuple[Callable[[], Recording], int]]:
+    """What opens each part, and the number of the recording that it is of."""
+    for number, recording in enumerate(recordings):
+        for part in recording.parts():
+            yield recording.part(part), number
+
+
+def _labels(opener: Callable[[], Recording], number: int) -> list[Label]:
+    with opener() as recording:
+        return recording.labels
+
+
+def _sample_part(
+    opener: Callable[[], Recording], number: int, limit: int, geometry: Geometry, n: int, seed: int
+) -> tuple[int, Volumes, Losses]:
+    """The number of the recording, volumes of one part of it, what could not be read."""
+    with opener() as recording:
+        windows = windows_of(recording.items(), geometry)
+        volumes = sample_volumes(windows, geometry, n, (seed, number), limit=limit)
+        return number, volumes, recording.losses
 
 
 def learn_encoder(
@@ -132,6 +181,7 @@ def learn_encoder(
     resume: Encoder | None = None,
     report: Report = lambda step, done, total, remark: None,
     keep: Keep = lambda make: None,
+    workers: Workers = HERE,
 ) -> Encoder:
     """Learn an encoder without labels; samples of held-out splits are not looked at.
 
@@ -144,6 +194,7 @@ def learn_encoder(
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.
         keep: may keep what was learned so far, which says of itself that it was interrupted.
+        workers: read and compute; what is learned is the same wherever that is.
 
     Raises:
         InputError: no usable volume was found, there are too few, a parameter is out of range, or `resume`
@@ -153,8 +204,8 @@ def learn_encoder(
     learner = _learner(setting)
     weights = {name: getattr(learner, name) for name in _WEIGHTS if hasattr(learner, name)}
     if resume:
-        _check_resumable(resume, setting, geometry_of(setting, recordings), weights)
-    material = prepare(recordings, setting, report)
+        _check_resumable(resume, setting, geometry_of(setting, recordings, workers), weights)
+    material = prepare(recordings, setting, report, workers)
     volumes = material.volumes
     volumes_hash = hashlib.sha256(volumes.counts.tobytes()).hexdigest()
     if resume and resume.provenance.get("volumes_sha256") != volumes_hash:

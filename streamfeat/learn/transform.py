@@ -14,8 +14,9 @@ from sklearn.utils.validation import check_is_fitted
 
 from streamfeat.errors import InputError
 from streamfeat.learn.alternation import Alternation, Step
-from streamfeat.learn.chunks import LazyVolumes, Rows, checked_rows, chunks
+from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.omega import Omega
+from streamfeat.workers import Sums
 
 __all__ = ["TransformLearner"]
 
@@ -55,8 +56,9 @@ class TransformLearner(Alternation):
     however far one goes towards it. It is taken only if it is better, and a few gradient steps follow, each
     shortened until the objective falls (Armijo): it never rises, and stays only where the gradient is zero.
 
-    State: at most `3 d^2 + 10 K d` float64, for each of `chunk_size` volumes `3 K + d` float32, and for each
-    volume 8 bytes, its squared length: of the volumes only the sums `X X'` and `L X'` over chunks are kept.
+    State: at most `3 d^2 + 10 K d` float64, for each thread that works `2 K d` more and for each of
+    `chunk_size` volumes `3 K + d` float32, and for each volume 8 bytes, its squared length: of the volumes
+    only the sums `X X'` and `L X'` over chunks are kept.
 
     Args:
         n_filters: `K`.
@@ -92,14 +94,11 @@ class TransformLearner(Alternation):
     log_det: float = 0.1
     max_iter: int = 30
 
-    def transform(self, X: ArrayLike | LazyVolumes) -> NDArray[np.float32]:
+    def transform(self, X: ArrayLike | ChunkedVolumes) -> NDArray[np.float32]:
         """Codes `(n, K)` of `(n, d)` whitened volumes: `sign(z) max(|z| - lambda0, 0)`, `z = A x`."""
         check_is_fitted(self)
-        volumes = checked_rows(self, X, reset=False)
-        codes = np.empty((volumes.shape[0], len(self.components_)), np.float32)
-        for where, chunk in chunks(volumes, self.chunk_size):
-            codes[where] = self._soft_threshold(chunk @ self.components_.T)
-        return codes
+        volumes = checked_volumes(self, X, self.chunk_size, reset=False)
+        return np.concatenate(volumes.fetch(volumes.each(_codes, self.components_, self.threshold)))
 
     @property
     def _n_rows(self) -> int:
@@ -112,13 +111,12 @@ class TransformLearner(Alternation):
         super()._check(n_volumes)
 
     def _alternate(
-        self, volumes: Rows, squares: NDArray[np.float64], rows: NDArray[np.float32]
+        self, volumes: ChunkedVolumes, squares: NDArray[np.float64], rows: NDArray[np.float32]
     ) -> Iterator[Step]:
         d = volumes.shape[1]
         # Conditioning is part of the quadratic form; never quite zero, so that the form has an inverse.
-        moment = max(self.conditioning, 1e-6) * np.eye(d)
-        for _, chunk in chunks(volumes, self.chunk_size):
-            moment += (chunk.T @ chunk) / volumes.shape[0]
+        (products,) = volumes.total(_products)
+        moment = max(self.conditioning, 1e-6) * np.eye(d) + products / volumes.shape[0]
         penalty = Omega(coherence=self.coherence, log_det=self.log_det)
         while True:
             cross, constant = self._code(volumes, rows)
@@ -131,22 +129,30 @@ class TransformLearner(Alternation):
                 rows = found
             yield Step(rows, constant + before, constant + min(before, after))
 
-    def _code(self, volumes: Rows, rows: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    def _code(self, volumes: ChunkedVolumes, rows: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
         """One pass over the volumes: `L X' / n`, and the part of the objective that `A` does not move."""
-        cross, constant = np.zeros(rows.shape), 0.0
-        used = np.zeros(len(rows), bool)
-        for _, chunk in chunks(volumes, self.chunk_size):
-            codes = self._soft_threshold(chunk @ rows.T)
-            used |= codes.any(axis=0)
-            cross += codes.T @ chunk
-            constant += 0.5 * float(np.square(codes).sum(dtype=np.float64))
-            constant += self.threshold * float(np.abs(codes).sum(dtype=np.float64))
-        self.unused_ = int(len(rows) - used.sum())
-        return cross / volumes.shape[0], constant / volumes.shape[0]
+        cross, used, parts = volumes.total(_code_sums, rows, self.threshold)
+        self.unused_ = int(np.count_nonzero(used == 0))
+        return cross / volumes.shape[0], float(parts[0] + self.threshold * parts[1]) / volumes.shape[0]
 
-    def _soft_threshold(self, z: NDArray[np.float32]) -> NDArray[np.float32]:
-        level = np.float32(self.threshold)
-        return np.asarray(z - z.clip(-level, level))
+
+def _codes(chunk: NDArray[np.float32], rows: NDArray[np.float32], threshold: float) -> NDArray[np.float32]:
+    """Soft thresholds `(m, K)`."""
+    z, level = chunk @ rows.T, np.float32(threshold)
+    return np.asarray(z - z.clip(-level, level))
+
+
+def _products(chunk: NDArray[np.float32]) -> Sums:
+    """The chunk's part of `X X'`."""
+    return ((chunk.T @ chunk).astype(np.float64),)
+
+
+def _code_sums(chunk: NDArray[np.float32], rows: NDArray[np.float32], threshold: float) -> Sums:
+    """The chunk's part of `L X'`, how many codes of each filter are not zero, and `(|L|^2 / 2, |L|_1)`."""
+    codes = _codes(chunk, rows, threshold)
+    halves = 0.5 * np.square(codes).sum(dtype=np.float64)
+    parts = np.array([halves, np.abs(codes).sum(dtype=np.float64)])
+    return (codes.T @ chunk).astype(np.float64), np.count_nonzero(codes, axis=0).astype(np.float64), parts
 
 
 def _update(problem: _Quadratic, A: NDArray[np.float64], before: float) -> NDArray[np.float64]:

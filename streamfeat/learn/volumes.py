@@ -4,20 +4,23 @@ Lives here: cutting a recording into windows, drawing volumes from them, keeping
 Not here: whitening and learning.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.geometry import Geometry
 from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet
 from streamfeat.window import count_window
 
-__all__ = ["Volumes", "Window", "sample_volumes", "windows_of"]
+__all__ = ["KEYS", "Volumes", "Window", "sample_volumes", "windows_of"]
+
+KEYS = 1 << 63
+"""Keys are below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +35,44 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Volumes:
-    """A sample of local volumes.
+    """Local volumes drawn from some windows, each with a random key.
+
+    Those of the smallest keys are a fair sample, in however many parts and wherever windows are read
+    (bottom-k sampling, Cohen and Kaplan 2007).
 
     Attributes:
+        keys: `(n,)` ascending.
         counts: `(n, d)` clipped counts, bin-major; int8, or int16 where `max_count` asks for it.
-        empty_share: share of the drawn places whose counts were all zero; they were drawn again.
+        drawn: places that were drawn.
+        empty: of them, those whose counts were all zero; they were drawn again.
         windows: how many windows were seen.
     """
 
+    keys: NDArray[np.int64]
     counts: NDArray[np.signedinteger]
-    empty_share: float
+    drawn: int
+    empty: int
     windows: int
+
+    @classmethod
+    def none(cls, geometry: Geometry) -> Self:
+        """No volume of no window."""
+        counts = np.empty((0, geometry.entries), np.min_scalar_type(-geometry.max_count))
+        return cls(np.empty(0, np.int64), counts, 0, 0, 0)
+
+    def with_others(self, others: Sequence["Volumes"], n: int) -> "Volumes":
+        """All together, but no more than `n`."""
+        parts = [self, *others]
+        keys = np.concatenate([part.keys for part in parts])
+        least = np.argsort(keys, kind="stable")[:n]
+        counts = np.concatenate([part.counts for part in parts])[least]
+        sums = (sum(getattr(part, name) for part in parts) for name in ("drawn", "empty", "windows"))
+        return Volumes(keys[least], counts, *sums)
+
+    @property
+    def empty_share(self) -> float:
+        """Share of the drawn places whose counts were all zero."""
+        return self.empty / max(self.drawn, 1)
 
 
 def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[Window]:
@@ -94,47 +124,53 @@ def sample_volumes(
     windows: Iterable[Window],
     geometry: Geometry,
     n_volumes: int,
-    rng: np.random.Generator,
+    seed: Sequence[int],
     *,
+    limit: int = KEYS,
     per_window: int = 64,
 ) -> Volumes:
     """Draw local volumes at random places, each not empty, with equal chance for every window.
 
-    From each window `per_window` places are drawn; over all windows a reservoir keeps `n_volumes`
-    (Vitter 1985, algorithm R), so recordings may be larger than memory.
+    From each window `per_window` places are kept. What is drawn from a window depends on `seed`, on when it
+    begins and on how many events it has, and on nothing that was read before.
 
     Args:
         windows: any number of windows; those with no place for a volume are passed over.
         geometry: of the volumes.
-        n_volumes: how many to keep.
-        rng: source of every random choice.
+        n_volumes: keep no more than those of the smallest keys; memory is for four times as many.
+        seed: not negative; the seed, and what tells recordings apart.
+        limit: keep only keys below.
         per_window: places to keep from each window.
-
-    Raises:
-        InputError: no volume with an event was found.
     """
-    kept = np.empty((n_volumes, geometry.entries), np.min_scalar_type(-geometry.max_count))
-    seen = drawn = empty = n_windows = 0
+    kept = Volumes.none(geometry)
+    waiting: list[Volumes] = []
+    n_waiting = 0
     for window in windows:
         if min(geometry.ring_shape(window.resolution)) < geometry.patch:
             continue
-        n_windows += 1
-        counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
-        places = sliding_window_view(counts, (geometry.patch, geometry.patch), axis=(1, 2))
-        rows = rng.integers(0, places.shape[1], 4 * per_window)
-        columns = rng.integers(0, places.shape[2], 4 * per_window)
-        volumes = places[:, rows, columns].transpose(1, 0, 2, 3).reshape(4 * per_window, -1)
-        filled = np.flatnonzero(volumes.any(axis=1))
-        drawn += len(volumes)
-        empty += len(volumes) - len(filled)
-        for volume in volumes[filled[:per_window]]:
-            slot = seen if seen < n_volumes else int(rng.integers(0, seen + 1))
-            if slot < n_volumes:
-                kept[slot] = volume
-            seen += 1
-    if seen == 0:
-        raise InputError(
-            f"no local volume of {geometry.patch}x{geometry.patch} pixels with an event was found in "
-            f"{n_windows} windows; check the recording's resolution and splits"
-        )
-    return Volumes(kept[: min(seen, n_volumes)], empty / drawn, n_windows)
+        one = _draw_from(window, geometry, seed, limit, per_window)
+        waiting.append(one)
+        n_waiting += len(one.keys) + 1
+        if n_waiting > max(n_volumes, 4 * per_window):
+            kept, waiting, n_waiting = kept.with_others(waiting, n_volumes), [], 0
+    return kept.with_others(waiting, n_volumes)
+
+
+def _draw_from(
+    window: Window, geometry: Geometry, seed: Sequence[int], limit: int, per_window: int
+) -> Volumes:
+    moment = window.origin_us % (1 << 64)  # a generator's seed is not negative
+    rng = np.random.default_rng([*seed, moment, len(window.events)])
+    counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
+    places = sliding_window_view(counts, (geometry.patch, geometry.patch), axis=(1, 2))
+    n = 4 * per_window
+    rows = rng.integers(0, places.shape[1], n)
+    columns = rng.integers(0, places.shape[2], n)
+    keys = rng.integers(0, KEYS, per_window)
+    volumes = places[:, rows, columns].transpose(1, 0, 2, 3).reshape(n, -1)
+    filled = np.flatnonzero(volumes.any(axis=1))
+    n_empty = n - len(filled)
+    filled, keys = filled[:per_window], keys[: len(filled)]
+    below = keys < limit
+    kind = np.min_scalar_type(-geometry.max_count)
+    return Volumes(keys[below], volumes[filled[below]].astype(kind), n, n_empty, 1)

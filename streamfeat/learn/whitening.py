@@ -12,7 +12,8 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
 from streamfeat.errors import InputError
-from streamfeat.learn.chunks import checked_rows, chunks
+from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
+from streamfeat.workers import Sums
 
 __all__ = ["VolumeWhitener"]
 
@@ -27,42 +28,38 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     Args:
         eps: added to the variance of each volume.
         eps_zca: added to every eigenvalue; large values whiten less.
-        chunk_size: volumes held as floats at a time.
+        chunk_size: volumes held as floats at a time by each thread.
 
     Attributes:
         mean_: `(d,)` float32, `mu`.
         whitening_: `(d, d)` float32, `W`, symmetric.
     """
 
-    def __init__(self, eps: float = 0.01, eps_zca: float = 0.1, chunk_size: int = 8192) -> None:
+    def __init__(self, eps: float = 0.01, eps_zca: float = 0.1, chunk_size: int = 2048) -> None:
         """Keep the parameters."""
         self.eps = eps
         self.eps_zca = eps_zca
         self.chunk_size = chunk_size
 
-    def fit(self, X: ArrayLike, y: Any = None) -> Self:
+    def fit(self, X: ArrayLike | ChunkedVolumes, y: Any = None) -> Self:
         """Learn mean and whitening from `(n, d)` volumes in one pass; sums are float64.
 
         Args:
-            X: an array or a memory map of any integer or float dtype; not changed.
+            X: an array or a memory map of any integer or float dtype, or volumes in chunks; not changed.
             y: ignored.
 
         Raises:
             InputError: there are not more volumes than entries, a value is not finite, or every volume is
                 constant.
         """
-        volumes = checked_rows(self, X)
+        volumes = checked_volumes(self, X, self.chunk_size)
         n, d = volumes.shape
         if n <= d:
             raise InputError(
                 f"n_samples = {n} is too few volumes for the covariance of their {d} entries; "
                 f"give more than {d}, or use a smaller patch or fewer bins"
             )
-        total, products = np.zeros(d), np.zeros((d, d))
-        for _, chunk in chunks(volumes, self.chunk_size):
-            normal = self._normalise(chunk)
-            total += normal.sum(axis=0, dtype=np.float64)
-            products += normal.T @ normal
+        total, products = volumes.total(_moments, self.eps)
         # Of a constant volume nothing but rounding is left.
         if np.trace(products) <= 1e-9 * n:
             raise InputError(
@@ -80,10 +77,11 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     def transform(self, X: ArrayLike) -> NDArray[np.float32]:
         """Whiten `(n, d)` volumes; float32."""
         check_is_fitted(self)
-        volumes = checked_rows(self, X, reset=False)
+        volumes = checked_volumes(self, X, self.chunk_size, reset=False)
         white = np.empty(volumes.shape, np.float32)
-        for where, chunk in chunks(volumes, self.chunk_size):
-            white[where] = (self._normalise(chunk) - self.mean_) @ self.whitening_
+        for start in range(0, len(white), self.chunk_size):
+            rows = slice(start, start + self.chunk_size)
+            white[rows] = (_normalised(volumes[rows], self.eps) - self.mean_) @ self.whitening_
         return white
 
     def __sklearn_tags__(self) -> Any:
@@ -92,7 +90,14 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         tags.transformer_tags.preserves_dtype = []
         return tags
 
-    def _normalise(self, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
-        values: NDArray[np.float32] = chunk - chunk.mean(axis=1, keepdims=True)
-        values /= np.sqrt(np.square(values).mean(axis=1, keepdims=True) + np.float32(self.eps))
-        return values
+
+def _normalised(chunk: NDArray[np.float32], eps: float) -> NDArray[np.float32]:
+    values: NDArray[np.float32] = chunk - chunk.mean(axis=1, keepdims=True)
+    values /= np.sqrt(np.square(values).mean(axis=1, keepdims=True) + np.float32(eps))
+    return values
+
+
+def _moments(chunk: NDArray[np.float32], eps: float) -> Sums:
+    """Sums of `v_hat` and of `v_hat v_hat'`."""
+    normal = _normalised(chunk, eps)
+    return normal.sum(axis=0, dtype=np.float64), (normal.T @ normal).astype(np.float64)
