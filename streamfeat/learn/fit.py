@@ -128,7 +128,7 @@ def _sample(
 ) -> Volumes:
     """A sample of all recordings; what is not of the smallest keys so far is not even sent."""
     n = setting.volumes
-    volumes = Volumes.none(geometry)
+    volumes, waiting = Volumes.none(geometry), list[Volumes]()
     parts = [*_openers(recordings)]
     losses = [Losses() for _ in recordings]
 
@@ -138,10 +138,11 @@ def _sample(
 
     found = workers.map(_sample_part, pieces(), geometry, n, setting.seed)
     for done, (number, more, lost) in enumerate(found, 1):
-        volumes = volumes.with_others([more], n)
         losses[number].add_all(lost)
-        remark = f"{recordings[number].path.name}, {volumes.windows:,} windows"
-        report("reading windows", done, len(parts), remark)
+        waiting.append(more)
+        if sum(len(one.keys) for one in waiting) > n // 4 or done == len(parts):
+            volumes, waiting = volumes.with_others(waiting, n), []
+        report("reading windows", done, len(parts), recordings[number].path.name)
     for recording, lost in zip(recordings, losses, strict=True):
         recording.losses = lost
     if len(volumes.keys) == 0:

@@ -1,0 +1,230 @@
+"""Work on other processes and machines, by Dask.
+
+Lives here: what streamfeat asks of a Dask cluster, and what it says when that fails.
+Not here: what the work is; which worker does it, and what is done again when one dies, Dask decides.
+
+Every function that is sent is a function of its arguments alone, and what goes into the first is kept by the
+scheduler: what a worker that dies has held is computed again on another from there.
+"""
+
+import platform
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from itertools import islice
+from types import FunctionType
+from typing import Any, TypeVar
+
+from streamfeat.errors import InputError
+from streamfeat.workers import Sums, add_sums, one_blas_thread
+
+try:
+    import dask
+    from distributed import Client, Future, LocalCluster, get_worker
+    from distributed.client import FutureCancelledError
+    from distributed.comm import CommClosedError
+    from distributed.scheduler import KilledWorker
+except ImportError as error:  # pragma: no cover
+    raise InputError(
+        f"{error}; other processes and machines need: pip install 'streamfeat[cluster]'"
+    ) from error
+
+__all__ = ["Cluster", "connected", "local"]
+
+R = TypeVar("R")
+
+_PATIENCE_S = 10.0
+_AHEAD = 3
+"""Pieces of work for each thread that are with the workers or waiting for them."""
+_FAN_IN = 4
+_PACKAGES = ("streamfeat", "numpy", "numba")
+"""What decides, with Python, what comes out."""
+
+_SETTINGS = {
+    "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
+    "distributed.admin.large-graph-warning-threshold": "1GB",
+}
+
+
+class Cluster:
+    """Workers of a Dask cluster; see `streamfeat.workers.Workers`.
+
+    Args:
+        client: connected.
+    """
+
+    def __init__(self, client: Client) -> None:
+        """Refuse workers that would compute something else.
+
+        Raises:
+            InputError: there is no worker, or one has another version of what computes.
+        """
+        self._client = client
+        self._versions = _versions()
+        with _one_line():
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
+            workers = client.get_versions(packages=list(_PACKAGES))["workers"]
+        for address, found in workers.items():
+            _check(self._versions, found["packages"], address)
+
+    @property
+    def dashboard(self) -> str:
+        """Where the engine shows what it does."""
+        return str(self._client.dashboard_link)
+
+    def map(
+        self, function: Callable[..., R], pieces: Iterable[tuple[Any, ...]], *common: Any
+    ) -> Generator[R, None, None]:
+        """See `Workers`."""
+        source = iter(pieces)
+        with _one_line():
+            n = _AHEAD * max(1, sum(self._client.nthreads().values()))
+
+            def begin(n: int) -> Iterator[Future]:
+                return (self._submit(function, *piece, *common) for piece in islice(source, n))
+
+            ahead = deque(begin(n))
+            try:
+                while ahead:
+                    yield ahead.popleft().result()
+                    ahead.extend(begin(1))
+            finally:
+                self._client.cancel(list(ahead))
+
+    def hold(self, value: Any) -> Any:
+        """Put a value where work is done: with the scheduler, which gives it to the workers that ask."""
+        if isinstance(value, Future | FunctionType | int | float | str | None):
+            return value
+        with _one_line():
+            return self._client.submit(_itself, value, pure=False)
+
+    def fetch(self, held: Sequence[Any]) -> list[Any]:
+        """See `Workers`."""
+        with _one_line():
+            return list(self._client.gather(list(held)))
+
+    def total(self, function: Callable[..., Sums], held: Sequence[tuple[Any, ...]], *common: Any) -> Sums:
+        """See `Workers`; sums are added on the workers, and those that can be are added first."""
+        with _one_line():
+            level = [self._submit(function, *values, *common) for values in held]
+            while len(level) > 1:
+                groups = [level[i : i + _FAN_IN] for i in range(0, len(level), _FAN_IN)]
+                level = [
+                    self._client.submit(add_sums, *group, pure=False, priority=1)
+                    if len(group) > 1
+                    else group[0]
+                    for group in groups
+                ]
+            sums: Sums = level[0].result()
+            return sums
+
+    def each(self, function: Callable[..., R], held: Sequence[tuple[Any, ...]], *common: Any) -> list[Any]:
+        """See `Workers`."""
+        with _one_line():
+            return [self._submit(function, *values, *common) for values in held]
+
+    def _sum(self, parts: Sequence[Future]) -> Future:
+        return self._client.submit(add_sums, *parts, pure=False, priority=1)
+
+    def _submit(self, function: Callable[..., R], *values: Any) -> Future:
+        # A piece that cannot be read on one machine may be read on another.
+        return self._client.submit(_worked, self._versions, function, *values, pure=False, retries=2)
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Cluster]:
+    """The workers of the scheduler at an address, such as `tcp://10.0.0.1:8786`.
+
+    Raises:
+        InputError: nobody answers there, there are no workers, or they have other versions.
+    """
+    with dask.config.set(_SETTINGS):
+        try:
+            client = Client(address, timeout=_PATIENCE_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no scheduler answers at {address} ({_reason(error)}); start one with `dask scheduler`, and "
+                "workers with `dask worker ADDRESS`"
+            ) from error
+        with client:
+            yield Cluster(client)
+
+
+@contextmanager
+def local(n_workers: int, threads: int | None = None) -> Iterator[Cluster]:
+    """Workers on this machine, each a process, until the block ends.
+
+    Args:
+        n_workers: how many.
+        threads: of each; together as many as there are cores if not given.
+
+    Raises:
+        InputError: they cannot be started.
+    """
+    if n_workers < 1:
+        raise InputError(f"{n_workers} workers cannot do anything; give at least one")
+    threads = threads or max(1, dask.system.CPU_COUNT // n_workers)
+    with dask.config.set(_SETTINGS), _one_line():
+        cluster = LocalCluster(
+            n_workers=n_workers,
+            threads_per_worker=threads,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            silence_logs="CRITICAL",
+        )
+        with cluster, Client(cluster, set_as_default=False) as client:
+            yield Cluster(client)
+
+
+def _versions() -> dict[str, str]:
+    """Of all that decides what comes out."""
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in _PACKAGES},
+    }
+
+
+def _check(wanted: dict[str, str], found: dict[str, Any], address: str) -> None:
+    for name, right in wanted.items():
+        there = found.get(name)
+        if name == "python":
+            there, right = ".".join(str(there).split(".")[:3]), ".".join(right.split(".")[:3])
+        if there != right:
+            has = f"has {name} {there}" if there else f"does not have {name}"
+            raise InputError(f"worker {address} {has}, here it is {right}; install the same on both")
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _worked(versions: dict[str, str], function: Callable[..., R], *values: Any) -> R:
+    """Call a function on a worker; what goes wrong there is told with its address."""
+    worker = get_worker().address
+    _check(versions, _versions(), worker)
+    try:
+        with one_blas_thread():
+            return function(*values)
+    except (InputError, OSError) as error:
+        raise InputError(f"{error} (on worker {worker})") from error
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """What can go wrong with a cluster, as one line."""
+    try:
+        yield
+    except KilledWorker as error:
+        raise InputError(
+            f"work was given up after {error.allowed_failures + 1} workers died of it or while they did it; "
+            "their logs tell why (too little memory?)"
+        ) from error
+    except ModuleNotFoundError as error:
+        raise InputError(f"a worker lacks a package: {error}; install the same there as here") from error
+    except (FutureCancelledError, CommClosedError, TimeoutError) as error:
+        raise InputError(f"the cluster is lost: {_reason(error)}") from error
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
