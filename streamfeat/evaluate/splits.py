@@ -9,12 +9,12 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
 from streamfeat.errors import InputError
+from streamfeat.places import Place
 from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet, Recording, open_recording
 
 __all__ = ["DataSet", "Fold"]
@@ -29,7 +29,7 @@ class Fold(Recording):
         held_out: positions of the labels that are, among those that are there.
     """
 
-    def __init__(self, path: Path, topic: str | None, held_out: frozenset[int] = frozenset()) -> None:
+    def __init__(self, path: Place, topic: str | None, held_out: frozenset[int] = frozenset()) -> None:
         """Open it."""
         self._held_out = held_out
         super().__init__(path, topic)
@@ -78,7 +78,7 @@ class DataSet:
     """
 
     def __init__(
-        self, paths: Sequence[Path], topic: str | None, folds: int, seed: int, on: str = "held-out"
+        self, paths: Sequence[Place], topic: str | None, folds: int, seed: int, on: str = "held-out"
     ) -> None:
         """Read the labels."""
         if on not in ("held-out", "train"):
@@ -149,7 +149,7 @@ class DataSet:
                 ]
 
 
-def _check_labels(path: Path, labels: Sequence[Label]) -> None:
+def _check_labels(path: Place, labels: Sequence[Label]) -> None:
     if not labels:
         raise InputError(f"{path}: has no labelled samples; `streamfeat convert` writes labels")
     missing = [i for i, label in enumerate(labels) if not label.label]
