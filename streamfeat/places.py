@@ -1,6 +1,7 @@
 """Where input is: a path, or the URL of something in a store.
 
-Lives here: what a URL is called and how it is shown, opening one through fsspec, and what its errors mean.
+Lives here: what a URL is called and how it is shown, opening, listing and fetching through fsspec, and what
+its errors mean.
 Not here: any format; and output, which is local.
 
 A plain path stays a `pathlib.Path` and costs nothing: fsspec is imported when a URL is opened. Credentials
@@ -11,6 +12,8 @@ files), so there is no option for them.
 import io
 import os
 import re
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +23,7 @@ from typing import Any, BinaryIO, cast
 
 from streamfeat.errors import InputError
 
-__all__ = ["Location", "Place", "open_binary", "place_of", "size_of"]
+__all__ = ["Location", "Place", "fetched", "files_below", "is_folder", "open_binary", "place_of", "size_of"]
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::[A-Za-z][A-Za-z0-9+.-]*)*://")
 _USER = re.compile(r"(?<=://)[^/\s'\"]*@")
@@ -29,7 +32,7 @@ _BLOCK_BYTES = 4 << 20
 _MOST_BLOCKS = 4
 """Of one file in memory. More than one, since records are looked at twice and lie across borders."""
 
-
+_WHOLE_ONLY = "the store gives it as a whole only; put simplecache:: before the URL"
 _OF_THE_EXTRA = frozenset(["fsspec", "s3fs", "aiobotocore", "botocore", "aiohttp"])
 
 
@@ -109,16 +112,74 @@ def size_of(place: Place) -> int:
         return file.seek(0, os.SEEK_END)
 
 
+def is_folder(place: Place) -> bool:
+    """Whether a place is there and holds others.
+
+    Raises:
+        InputError: the store does not say.
+    """
+    if isinstance(place, Path):
+        return place.is_dir()
+    with _explaining(place):
+        system, path = _system_of(place)
+        return bool(system.isdir(path))
+
+
+def files_below(folder: Location) -> list[tuple[Location, str]]:
+    """All files in a folder, however deep, and for each its path from there, with forward slashes.
+
+    Raises:
+        InputError: the store does not list them.
+    """
+    with _explaining(folder):
+        system, root = _system_of(folder)
+        root = str(root).rstrip("/") + "/"
+        names = [str(path).removeprefix(root) for path in system.find(root)]
+    # The folder is in the first of a chain that has a path; what is below it goes there.
+    before, separator, rest = folder.url.partition("://")
+    there, *others = rest.split("::")
+    return [
+        (Location("::".join([f"{before}{separator}{there.rstrip('/')}/{name}", *others])), name)
+        for name in names
+    ]
+
+
+@contextmanager
+def fetched(place: Place) -> Iterator[Path]:
+    """A local file with the content of a place: a path itself, or a copy that is there for the block only.
+
+    Raises:
+        InputError: the store does not give all of it, or there is no room for the copy.
+    """
+    if isinstance(place, Path):
+        yield place
+        return
+    with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
+        path = Path(folder, place.name)
+        try:
+            with open_binary(place) as source, path.open("wb") as copy:
+                shutil.copyfileobj(source, copy, _BLOCK_BYTES)
+        except OSError as error:
+            raise InputError(f"{place}: no copy in {folder}: {error.strerror}; is there room?") from None
+        yield path
+
+
+def _system_of(location: Location) -> tuple[Any, Any]:
+    """The file system of fsspec that a URL means, and the path in it."""
+    from fsspec.core import url_to_fs
+
+    system, path = url_to_fs(location.url)
+    return system, path
+
+
 class _StoredFile(io.BufferedIOBase):
     """A file that fsspec opened, with a position of its own and errors in one line."""
 
     def __init__(self, location: Location) -> None:
         self._location, self._at = location, 0
         with _explaining(location):
-            from fsspec.core import url_to_fs
-
             # The system is kept, since one that is a file itself (an archive) is closed with it.
-            self._system, path = url_to_fs(location.url)
+            self._system, path = _system_of(location)
             self._file: Any = self._system.open(
                 path,
                 "rb",
@@ -126,12 +187,19 @@ class _StoredFile(io.BufferedIOBase):
                 cache_type="blockcache",
                 cache_options={"maxblocks": _MOST_BLOCKS},
             )
-            if not self._file.seekable():
-                self._file.close()
-                raise InputError(
-                    f"{location}: the store gives it as a whole only; put simplecache:: before the URL"
-                )
-            self._size = int(self._file.seek(0, os.SEEK_END))
+            self._size = self._size_at(path)
+
+    def _size_at(self, path: str) -> int:
+        """Bytes of what was opened at a path of the system, if it is a file of which parts can be read."""
+        try:
+            size = int(self._file.seek(0, os.SEEK_END))
+        except (ValueError, OSError):  # which kind depends on the store
+            raise InputError(f"{self._location}: {_WHOLE_ONLY}") from None
+        # A cache keeps what it had when its store went away, and takes that for the file the next time.
+        expected = self._system.info(path).get("size") if "::" in self._location.url else size
+        if expected not in (size, None):
+            raise InputError(f"{self._location}: {size} of {expected} bytes were fetched; start again")
+        return size
 
     def readable(self) -> bool:
         return True
@@ -193,7 +261,7 @@ def _reason(error: Exception) -> str:
     causes: list[BaseException] = [error]
     while causes[-1].__cause__:
         causes.append(causes[-1].__cause__)
-    said = str(causes[-1]) or type(causes[-1]).__name__
+    said = str(causes[-1]).partition("\n")[0] or type(causes[-1]).__name__
     statuses = [getattr(cause, "status", None) for cause in causes]
     if isinstance(error, ImportError):
         names = {(cause.name or "").partition(".")[0] for cause in causes if isinstance(cause, ImportError)}
@@ -202,6 +270,8 @@ def _reason(error: Exception) -> str:
         )
     if isinstance(error, ValueError) and "rotocol not known" in said:
         return f"no such kind of URL: {said}"
+    if isinstance(error, ValueError) and "range requests" in said:
+        return _WHOLE_ONLY
     if type(causes[-1]).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
         return (
             f"{said}; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=1 for what is public"

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -40,3 +41,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real recordings: set STREAMFEAT_DATA to their folder")
     return folder.resolve()
+
+
+@pytest.fixture
+def command(monkeypatch, capfd):
+    """Run the command line in this process, through `main`: exit status, what it prints, what it says."""
+    from streamfeat import cli
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capfd.readouterr()
+        return end.value.code or 0, said.out, said.err
+
+    return call

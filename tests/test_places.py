@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from streamfeat import cli
 from streamfeat.errors import InputError
 from streamfeat.places import Location, open_binary, place_of, size_of
 from streamfeat.recorder import recover
@@ -20,21 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "recordings" / "digits_test.mcap"
 
 fsspec = pytest.importorskip("fsspec", reason="URLs need the extra `store`")
-
-
-@pytest.fixture
-def run(monkeypatch, capfd):
-    """Run the command line in this process: exit status, what it prints, and what it says."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        said = capfd.readouterr()
-        return end.value.code or 0, said.out, said.err
-
-    return call
 
 
 @pytest.fixture
@@ -100,10 +84,10 @@ def test_what_is_secret_in_a_url_is_not_shown(url, shown):
     assert repr(Location(url)) == f"Location({shown!r})"
 
 
-def test_errors_do_not_show_what_is_secret(run):
+def test_errors_do_not_show_what_is_secret(command):
     # Nobody listens on port 1.
     for url in ("http://anna:geheim@127.0.0.1:1/a.mcap?sig=geheim", "ftp://anna:geheim@127.0.0.1:1/a.mcap"):
-        status, out, err = run("info", url)
+        status, out, err = command("info", url)
         assert status == 2
         assert "geheim" not in out + err
         assert err.startswith(f"error: {Location(url)}: ")
@@ -160,8 +144,8 @@ def test_a_file_that_becomes_shorter_is_an_error_and_no_shorter_recording(tmp_pa
         ("simplecache::nokind://a/b.mcap", "no such kind of URL"),
     ],
 )
-def test_what_cannot_be_opened_is_one_line(run, url, what):
-    status, _, err = run("info", url)
+def test_what_cannot_be_opened_is_one_line(command, url, what):
+    status, _, err = command("info", url)
     assert status == 2
     assert err.startswith(f"error: {url}: {what}")
     assert err.count("\n") == 1
@@ -188,10 +172,10 @@ def test_a_path_does_not_wait_for_fsspec():
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=100).returncode == 0
 
 
-def test_info_of_a_url_is_that_of_the_path(run, memory):
-    status, out, err = run("info", memory, "--json")
+def test_info_of_a_url_is_that_of_the_path(command, memory):
+    status, out, err = command("info", memory, "--json")
     assert (status, err) == (0, "")
-    expected = json.loads(run("info", SOURCE, "--json")[1])
+    expected = json.loads(command("info", SOURCE, "--json")[1])
     assert json.loads(out) == expected | {"file": memory}
 
 
