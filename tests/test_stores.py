@@ -204,6 +204,8 @@ class Web(http.server.BaseHTTPRequestHandler):
     """Serves the recording; the folder in the address says how."""
 
     protocol_version = "HTTP/1.1"
+    served = 0
+    """Bytes, so far."""
 
     def do_GET(self):
         how = self.path.split("/")[1]
@@ -225,9 +227,10 @@ class Web(http.server.BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         if self.command == "GET":
+            Web.served += len(data)
             self.close_connection = True
             # A connection that ends before what was promised has come.
-            cut = how == "half" or (how == "cut" and start > len(DATA) // 2)
+            cut = how == "half" or (how == "cut" and 0.5 < start / len(DATA) < 0.8)
             # Who has read what it wanted may be gone before the rest.
             with contextlib.suppress(ConnectionError):
                 self.wfile.write(data[: len(data) // 2] if cut else data)
@@ -252,6 +255,14 @@ def test_a_recording_in_the_web_is_the_same(web, small_blocks):
     assert items(f"{web}/good/a.mcap?sig={SECRET}") == items(SOURCE)
 
 
+def test_a_pass_fetches_each_byte_once_and_keeps_few(web, small_blocks):
+    with open_recording(f"{web}/good/a.mcap") as recording:
+        before = Web.served
+        list(recording)
+        assert Web.served - before <= len(DATA)
+        assert recording._file._file.cache.cache_info().currsize == 4
+
+
 @pytest.mark.parametrize(
     ("how", "what"),
     [
@@ -267,6 +278,16 @@ def test_a_web_server_that_does_not_give_all_is_one_line(web, small_blocks, comm
     assert status == 2
     assert is_one_line(err, str(Location(url)))
     assert re.search(what, err)
+
+
+def test_a_replay_that_a_store_leaves_has_no_output(web, small_blocks, command, tmp_path):
+    url = f"{web}/cut/a.mcap"
+    outputs = [tmp_path / "out.mcap", tmp_path / "out.jsonl"]
+    model = SOURCE.with_name("digits.safetensors")
+    status, out, err = command("replay", url, "-m", model, "-o", outputs[0], "--json-lines", outputs[1], "-q")
+    assert (status, out) == (2, "")
+    assert is_one_line(err, str(Location(url)))
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_a_server_that_gives_whole_files_only_is_read_through_a_cache(web, small_blocks):

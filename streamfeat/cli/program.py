@@ -87,7 +87,7 @@ err = Console(stderr=True, highlight=False, emoji=False)
 if TYPE_CHECKING:
     AnyPlace = Place
 else:
-    AnyPlace = object  # Typer knows no unions; a command gets what the parser gives
+    AnyPlace = type("path|URL", (), {})  # Typer knows no unions; a command gets what the parser gives
 RecordingArgument = Annotated[
     AnyPlace, typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=place_of)
 ]
