@@ -187,7 +187,11 @@ class _StoredFile(io.BufferedIOBase):
                 cache_type="blockcache",
                 cache_options={"maxblocks": _MOST_BLOCKS},
             )
-            self._size = self._size_at(path)
+            try:
+                self._size = self._size_at(path)
+            except BaseException:
+                self._file.close()
+                raise
 
     def _size_at(self, path: str) -> int:
         """Bytes of what was opened at a path of the system, if it is a file of which parts can be read."""

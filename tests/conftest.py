@@ -1,8 +1,10 @@
 """Fixtures of the whole suite."""
 
+import json
 import os
 import signal
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -43,9 +45,22 @@ def shared_data() -> Path:
     return folder.resolve()
 
 
+@dataclass(frozen=True)
+class Result:
+    """What became of a command: its exit status, what it printed, and what it said besides."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
 @pytest.fixture
-def command(monkeypatch, capfd):
-    """Run the command line in this process, through `main`: exit status, what it prints, what it says."""
+def run(monkeypatch, capfd):
+    """Run the command line in this process, through `main`."""
     from streamfeat import cli
 
     def call(*arguments):
@@ -54,6 +69,6 @@ def command(monkeypatch, capfd):
         with pytest.raises(SystemExit) as end:
             cli.main()
         said = capfd.readouterr()
-        return end.value.code or 0, said.out, said.err
+        return Result(end.value.code or 0, said.out, said.err)
 
     return call

@@ -1,6 +1,5 @@
 """Recordings by URL: the same results as from a path, and one line where a store does not give them."""
 
-import json
 import pickle
 import shutil
 import subprocess
@@ -84,15 +83,15 @@ def test_what_is_secret_in_a_url_is_not_shown(url, shown):
     assert repr(Location(url)) == f"Location({shown!r})"
 
 
-def test_errors_do_not_show_what_is_secret(command):
+def test_errors_do_not_show_what_is_secret(run):
     # Nobody listens on port 1.
     for url in ("http://anna:geheim@127.0.0.1:1/a.mcap?sig=geheim", "ftp://anna:geheim@127.0.0.1:1/a.mcap"):
-        status, out, err = command("info", url)
-        assert status == 2
-        assert "geheim" not in out + err
-        assert err.startswith(f"error: {Location(url)}: ")
-        assert "Traceback" not in err
-        assert err.count("\n") == 1
+        done = run("info", url)
+        assert done.status == 2
+        assert "geheim" not in done.out + done.err
+        assert done.err.startswith(f"error: {Location(url)}: ")
+        assert "Traceback" not in done.err
+        assert done.err.count("\n") == 1
 
 
 def test_every_kind_of_url_gives_what_the_path_gives(memory, tmp_path):
@@ -144,11 +143,11 @@ def test_a_file_that_becomes_shorter_is_an_error_and_no_shorter_recording(tmp_pa
         ("simplecache::nokind://a/b.mcap", "no such kind of URL"),
     ],
 )
-def test_what_cannot_be_opened_is_one_line(command, url, what):
-    status, _, err = command("info", url)
-    assert status == 2
-    assert err.startswith(f"error: {url}: {what}")
-    assert err.count("\n") == 1
+def test_what_cannot_be_opened_is_one_line(run, url, what):
+    done = run("info", url)
+    assert done.status == 2
+    assert done.err.startswith(f"error: {url}: {what}")
+    assert done.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("missing", ["fsspec", "s3fs"])
@@ -172,11 +171,11 @@ def test_a_path_does_not_wait_for_fsspec():
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=100).returncode == 0
 
 
-def test_info_of_a_url_is_that_of_the_path(command, memory):
-    status, out, err = command("info", memory, "--json")
-    assert (status, err) == (0, "")
-    expected = json.loads(command("info", SOURCE, "--json")[1])
-    assert json.loads(out) == expected | {"file": memory}
+def test_info_of_a_url_is_that_of_the_path(run, memory):
+    done = run("info", memory, "--json")
+    assert (done.status, done.err) == (0, "")
+    expected = run("info", SOURCE, "--json").json
+    assert done.json == expected | {"file": memory}
 
 
 def test_a_recording_is_recovered_from_a_url(memory, tmp_path):

@@ -2,7 +2,6 @@
 
 import contextlib
 import http.server
-import json
 import re
 import threading
 
@@ -95,18 +94,18 @@ def test_a_recording_in_s3_is_the_same(store, small_blocks):
     assert items(f"simplecache::{store.url}") == items(SOURCE)
 
 
-def test_info_learn_and_replay_give_the_same_from_s3(store, digits, command, tmp_path):
+def test_info_learn_and_replay_give_the_same_from_s3(store, digits, run, tmp_path):
     url = store.put(digits)
     found = []
     for source in (digits, url):
         model, lines = tmp_path / f"{len(found)}.safetensors", tmp_path / f"{len(found)}.jsonl"
-        assert command("learn", source, "-o", model, *FEW)[0] == 0
-        status, out, _ = command(
+        assert run("learn", source, "-o", model, *FEW).status == 0
+        done = run(
             "replay", source, "-m", model, "--emit", "10ms", "--json-lines", lines, "--features", "--json"
         )
-        assert status == 0
-        result = {name: value for name, value in json.loads(out).items() if not CLOCKS.search(name)}
-        info = json.loads(command("info", source, "--json")[1]) | {"file": ""}
+        assert done.status == 0
+        result = {name: value for name, value in done.json.items() if not CLOCKS.search(name)}
+        info = run("info", source, "--json").json | {"file": ""}
         encoder = Encoder.load(model)
         found.append((info, encoder.fingerprint, encoder.provenance["recordings"], result, lines.read_text()))
     assert found[0] == found[1]
@@ -145,19 +144,19 @@ def test_a_data_set_in_s3_is_converted_as_one_in_a_folder(store, tmp_path):
 
 
 @pytest.mark.parametrize("url", ["s3://lab/nothing.mcap", "s3://no-such-bucket/a.mcap"])
-def test_what_is_not_there_is_one_line(store, command, url):
-    status, _, err = command("info", url)
-    assert status == 2
-    assert is_one_line(err, url)
-    assert "there is no such file; check the name, and that of the bucket" in err
+def test_what_is_not_there_is_one_line(store, run, url):
+    done = run("info", url)
+    assert done.status == 2
+    assert is_one_line(done.err, url)
+    assert "there is no such file; check the name, and that of the bucket" in done.err
 
 
-def test_a_server_that_does_not_know_who_asks_is_one_line(store, refuse, command):
+def test_a_server_that_does_not_know_who_asks_is_one_line(store, refuse, run):
     refuse()
-    status, _, err = command("info", store.url)
-    assert status == 2
-    assert is_one_line(err, store.url)
-    assert "the store refuses: " in err
+    done = run("info", store.url)
+    assert done.status == 2
+    assert is_one_line(done.err, store.url)
+    assert "the store refuses: " in done.err
 
 
 def midway(source, happens):
@@ -272,21 +271,21 @@ def test_a_pass_fetches_each_byte_once_and_keeps_few(web, small_blocks):
         ("whole", "the store gives it as a whole only; put simplecache:: before"),
     ],
 )
-def test_a_web_server_that_does_not_give_all_is_one_line(web, small_blocks, command, how, what):
+def test_a_web_server_that_does_not_give_all_is_one_line(web, small_blocks, run, how, what):
     url = f"{web}/{how}/a.mcap?sig={SECRET}"
-    status, _, err = command("info", url)
-    assert status == 2
-    assert is_one_line(err, str(Location(url)))
-    assert re.search(what, err)
+    done = run("info", url)
+    assert done.status == 2
+    assert is_one_line(done.err, str(Location(url)))
+    assert re.search(what, done.err)
 
 
-def test_a_replay_that_a_store_leaves_has_no_output(web, small_blocks, command, tmp_path):
+def test_a_replay_that_a_store_leaves_has_no_output(web, small_blocks, run, tmp_path):
     url = f"{web}/cut/a.mcap"
     outputs = [tmp_path / "out.mcap", tmp_path / "out.jsonl"]
     model = SOURCE.with_name("digits.safetensors")
-    status, out, err = command("replay", url, "-m", model, "-o", outputs[0], "--json-lines", outputs[1], "-q")
-    assert (status, out) == (2, "")
-    assert is_one_line(err, str(Location(url)))
+    done = run("replay", url, "-m", model, "-o", outputs[0], "--json-lines", outputs[1], "-q")
+    assert (done.status, done.out) == (2, "")
+    assert is_one_line(done.err, str(Location(url)))
     assert [*tmp_path.iterdir()] == []
 
 

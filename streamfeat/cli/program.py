@@ -87,7 +87,8 @@ err = Console(stderr=True, highlight=False, emoji=False)
 if TYPE_CHECKING:
     AnyPlace = Place
 else:
-    AnyPlace = type("path|URL", (), {})  # Typer knows no unions; a command gets what the parser gives
+    # Typer knows no unions: help shows this name, and a command gets what the parser gives.
+    AnyPlace = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
 RecordingArgument = Annotated[
     AnyPlace, typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=place_of)
 ]
