@@ -18,7 +18,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from pathlib import Path
 from typing import BinaryIO
 
 import lz4.frame
@@ -29,6 +28,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Header, Message, Schema, Statistics
 
 from streamfeat.errors import InputError, printable
+from streamfeat.places import Place, open_binary
 
 __all__ = [
     "MAX_RECORD_BYTES",
@@ -100,23 +100,25 @@ class Summary:
     """The byte where each chunk starts."""
 
 
-def open_mcap(path: Path) -> BinaryIO:
+def open_mcap(place: Place) -> BinaryIO:
     """Open a file that begins like an MCAP file.
 
     Raises:
-        InputError: it is missing, empty, or begins otherwise.
+        InputError: it is missing, empty, or begins otherwise; and while a file in a store is read, the store
+            does not give what is in it.
     """
+    file = open_binary(place)
     try:
-        file = path.open("rb")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
-    magic = file.read(len(_MAGIC))
+        magic = file.read(len(_MAGIC))
+    except BaseException:
+        file.close()
+        raise
     # One byte may be damaged, if it is not the version: what follows has sums of its own.
     wrong = [at for at, (byte, right) in enumerate(zip(magic, _MAGIC, strict=False)) if byte != right]
     if len(magic) < len(_MAGIC) or len(wrong) > 1 or _VERSION_AT in wrong:
         file.close()
         what = "is empty" if not magic else "is not an MCAP recording"
-        raise InputError(f"{path}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
+        raise InputError(f"{place}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
     return file
 
 
@@ -157,7 +159,8 @@ def iter_records(
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
     Messages of a chunk carry the byte of the chunk. Damage is skipped up to the next readable record or
-    chunk and counted in `losses`, which is changed. Nothing is raised but `OSError`.
+    chunk and counted in `losses`, which is changed. Nothing is raised but errors of reading: `OSError`, or
+    `InputError` where the file is in a store.
 
     Args:
         file: opened by `open_mcap`.

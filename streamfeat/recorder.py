@@ -24,6 +24,7 @@ from streamfeat.events import Events, Resolution
 from streamfeat.mcap_records import Losses, count_missing, iter_messages, open_mcap, read_summary
 from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.packets import Label, PacketWriter
+from streamfeat.places import Location, place_of
 
 __all__ = ["RecordingWriter", "recover"]
 
@@ -39,7 +40,7 @@ _Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
 
 
 def recover(
-    source: str | PathLike[str],
+    source: str | PathLike[str] | Location,
     target: str | PathLike[str],
     *,
     overwrite: bool = False,
@@ -63,7 +64,7 @@ def recover(
     losses, copied = Losses(), Counter[int]()
     # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
     writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
-    with writer, open_mcap(Path(source)) as file:
+    with writer, open_mcap(place_of(source)) as file:
         summary = read_summary(file)
         total = sum(summary.message_counts.values()) if summary else 0
         for done, (_, channel, schema, message) in enumerate(iter_messages(file, summary, losses), 1):

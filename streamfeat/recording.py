@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from os import PathLike
-from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
@@ -34,6 +33,7 @@ from streamfeat.mcap_records import (
 )
 from streamfeat.messages import LabelMessage
 from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.places import Location, Place, place_of
 from streamfeat.samples import Sample, complete_samples
 
 __all__ = [
@@ -105,16 +105,17 @@ class _Totals:
         self.last_us = last if self.last_us is None else max(last, self.last_us)
 
 
-def open_recording(path: str | PathLike[str], topic: str | None = None) -> "Recording":
+def open_recording(path: str | PathLike[str] | Location, topic: str | None = None) -> "Recording":
     """Open an MCAP recording of events.
 
     Args:
-        path: the file.
+        path: the file; text that is a URL means a file in a store, see `streamfeat.places`.
         topic: the event topic to read; may be left out when there is only one.
 
     Raises:
         InputError: the file is missing, empty or no MCAP; it has no event topic, several and none was
-            chosen, or not the chosen one; or not a single packet of the topic can be read.
+            chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
+            it, too, where a store refuses or goes away.
     """
     return Recording(path, topic)
 
@@ -126,16 +127,18 @@ class Recording:
     (an iteration, or the first use of a count) could not read.
     """
 
-    path: Path
+    path: Place
     topics: list[Topic]
     topic: str
     resolution: Resolution
     encoding: str
     losses: Losses
 
-    def __init__(self, path: str | PathLike[str], topic: str | None = None, part: Part = WHOLE) -> None:
+    def __init__(
+        self, path: str | PathLike[str] | Location, topic: str | None = None, part: Part = WHOLE
+    ) -> None:
         """See `open_recording`."""
-        self.path = Path(path)
+        self.path = place_of(path)
         self._part = part
         self._file = open_mcap(self.path)
         try:
@@ -365,7 +368,7 @@ def _topics(known: Summary) -> list[Topic]:
     return [Topic(*key, n_messages=n) for key, n in counts.items()]
 
 
-def _choose_topic(path: Path, topics: list[Topic], wanted: str | None) -> str:
+def _choose_topic(path: Place, topics: list[Topic], wanted: str | None) -> str:
     names = sorted({t.name for t in topics if t.schema in EVENT_SCHEMAS})
     if not names:
         raise InputError(f"{path}: no topic carries {' or '.join(EVENT_SCHEMAS)}; is this the right file?")

@@ -20,6 +20,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.mcap_records import Losses
 from streamfeat.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.places import Place
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label, Packet, Recording, open_recording
 from streamfeat.session import Session
@@ -49,7 +50,7 @@ class Replay:
 
     def __init__(
         self,
-        recording: Path,
+        recording: Place,
         model: Path,
         classifier: Path | None = None,
         *,

@@ -1,7 +1,10 @@
 """Fixtures of the whole suite."""
 
+import json
 import os
 import signal
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -40,3 +43,32 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real recordings: set STREAMFEAT_DATA to their folder")
     return folder.resolve()
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a command: its exit status, what it printed, and what it said besides."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
+@pytest.fixture
+def run(monkeypatch, capfd):
+    """Run the command line in this process, through `main`."""
+    from streamfeat import cli
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capfd.readouterr()
+        return Result(end.value.code or 0, said.out, said.err)
+
+    return call

@@ -32,30 +32,6 @@ LEARN += ["--iterations", "2"]
 COMMANDS = ["info", "convert", "learn", "train", "replay"]
 
 
-class Result:
-    def __init__(self, status, out, err):
-        self.status, self.out, self.err = status, out, err
-
-    @property
-    def json(self):
-        return json.loads(self.out)
-
-
-@pytest.fixture
-def run(monkeypatch, capfd):
-    """Run the command line in this process, through `main`."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capfd.readouterr()
-        return Result(end.value.code or 0, captured.out, captured.err)
-
-    return call
-
-
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """A folder with recordings, and a model and a classifier for each formulation."""

@@ -14,6 +14,7 @@ PACKAGE = Path(streamfeat.__file__).parent
 
 LAYERS = [
     {"errors", "events", "kernels.compiled", "kernels.layout"},
+    {"places"},
     {
         "geometry",
         "files",
@@ -109,6 +110,7 @@ ONLY_IN = {
         "cli.viewing",
     },
     "hdrh": {"latency.histogram"},
+    "fsspec": {"places"},
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
     "pyarrow": {"table"},

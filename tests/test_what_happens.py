@@ -42,6 +42,12 @@ ROWS = {
     "files of a data set cannot be read": [
         "test_datasets.py::test_bad_samples_are_reported_and_the_others_converted"
     ],
+    "a store refuses, or goes away midway": [
+        "test_stores.py::test_a_replay_that_a_store_leaves_has_no_output",
+        "test_stores.py::test_a_conversion_that_a_store_leaves_writes_nothing",
+        "test_stores.py::test_a_server_that_refuses_midway_does_not_end_the_recording",
+        "test_stores.py::test_a_server_that_stops_midway_does_not_end_the_recording",
+    ],
     "a sink is slow, in a replay": [
         "test_pipeline.py::test_a_slow_sink_fills_bounded_queues_and_loses_nothing"
     ],

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from streamfeat.cli.program import (
+    AnyPlace,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -25,6 +26,7 @@ from streamfeat.cli.program import (
     refuse_existing,
 )
 from streamfeat.errors import InputError
+from streamfeat.places import place_of
 
 if TYPE_CHECKING:
     from streamfeat.live.names import Names
@@ -163,7 +165,7 @@ def publish(
 
     if len(sources) % 2:
         raise InputError("give each recording a key: publish ONE.mcap cam0/events TWO.mcap cam1/events")
-    pairs = [(Path(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
+    pairs = [(place_of(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
     for _, key in pairs:
         names = RosNames(key, domain) if ros2 else PlainNames(key)
     job = Publish(
@@ -219,7 +221,10 @@ def record(
 
 @app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
 def recover(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="Damaged or unfinished recording.")],
+    source: Annotated[
+        AnyPlace,
+        typer.Argument(metavar="IN", help="Damaged recording, or its URL.", parser=place_of),
+    ],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,

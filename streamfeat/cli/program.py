@@ -29,11 +29,13 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from streamfeat.errors import InputError
+from streamfeat.places import Place, place_of
 
 if TYPE_CHECKING:
     from streamfeat.mcap_records import Losses
 
 __all__ = [
+    "AnyPlace",
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
@@ -82,9 +84,17 @@ app = typer.Typer(
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
 
-RecordingArgument = Annotated[Path, typer.Argument(metavar="REC", help="MCAP recording of events.")]
+if TYPE_CHECKING:
+    AnyPlace = Place
+else:
+    # Typer knows no unions: help shows this name, and a command gets what the parser gives.
+    AnyPlace = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
+RecordingArgument = Annotated[
+    AnyPlace, typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=place_of)
+]
 RecordingsArgument = Annotated[
-    list[Path], typer.Argument(metavar="REC...", help="MCAP recordings of events.")
+    list[AnyPlace],
+    typer.Argument(metavar="REC...", help="MCAP recordings of events, or their URLs.", parser=place_of),
 ]
 TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]

@@ -4,13 +4,13 @@ Lives here: their arguments, and how their results are shown.
 Not here: reading and writing (`recording`, `recorder`, `foreign`).
 """
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from streamfeat.cli.program import (
+    AnyPlace,
     JsonOption,
     OverwriteOption,
     QuietOption,
@@ -23,6 +23,7 @@ from streamfeat.cli.program import (
     progress_bars,
 )
 from streamfeat.errors import InputError
+from streamfeat.places import place_of
 
 __all__ = ["convert", "info"]
 
@@ -66,8 +67,13 @@ def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonO
 
 @app.command(epilog="Example: streamfeat convert n-cars_train ncars.mcap --split-every 5")
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="Data set folder or camera file.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
+    source: Annotated[
+        AnyPlace,
+        typer.Argument(metavar="IN", help="Data set folder or camera file, or its URL.", parser=place_of),
+    ],
+    target: Annotated[
+        AnyPlace, typer.Argument(metavar="OUT.mcap", help="Recording to write.", parser=place_of)
+    ],
     split_every: Annotated[
         int | None,
         typer.Option(help="Every n-th sample is split 'validation', the others 'train'."),

@@ -24,6 +24,7 @@ from streamfeat.cli.program import (
     refuse_existing,
 )
 from streamfeat.errors import InputError
+from streamfeat.places import Location, Place, place_of
 
 __all__ = ["view"]
 
@@ -35,7 +36,8 @@ __all__ = ["view"]
 def view(
     model: ModelOption,
     source: Annotated[
-        str | None, typer.Argument(metavar="REC|KEYEXPR", help="MCAP recording, or live zenoh topics.")
+        str | None,
+        typer.Argument(metavar="REC|KEYEXPR", help="MCAP recording or its URL, or live topics."),
     ] = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
@@ -116,9 +118,9 @@ def view(
     print_result(job.result(), "viewed", as_json=as_json)
 
 
-def _recording(source: str | None) -> Path | None:
-    """The recording that is meant, if it is one: a file that exists, or is called as one."""
+def _recording(source: str | None) -> Place | None:
+    """The recording that is meant, if it is one: a URL, a file that exists, or what is called as one."""
     if source is None:
         return None
-    path = Path(source)
-    return path if path.suffix == ".mcap" or path.is_file() else None
+    place = place_of(source)
+    return place if isinstance(place, Location) or place.suffix == ".mcap" or place.is_file() else None

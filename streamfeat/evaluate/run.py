@@ -27,6 +27,7 @@ from streamfeat.evaluate.scores import (
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files import write_atomically
 from streamfeat.machine import describe_machine
+from streamfeat.places import size_of
 from streamfeat.workers import HERE, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
@@ -145,7 +146,7 @@ def evaluate(
     header = {
         "format": "streamfeat-evaluate",
         "version": _VERSION,
-        "recordings": [[str(path.name), path.stat().st_size] for path in data.paths],
+        "recordings": [[path.name, size_of(path)] for path in data.paths],
         "folds": data.n_folds,
         "scored": data.scored,
         "early_samples": early_samples,

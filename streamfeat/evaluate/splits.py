@@ -10,12 +10,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
 from streamfeat.errors import InputError
+from streamfeat.places import Place
 from streamfeat.recording import HELD_OUT_SPLITS, WHOLE, Label, Packet, Part, Recording, open_recording
 
 __all__ = ["DataSet", "Fold"]
@@ -32,7 +32,7 @@ class Fold(Recording):
     """
 
     def __init__(
-        self, path: Path, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
+        self, path: Place, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
     ) -> None:
         """Open it."""
         self._held_out = held_out
@@ -84,7 +84,7 @@ class DataSet:
     """
 
     def __init__(
-        self, paths: Sequence[Path], topic: str | None, folds: int, seed: int, on: str = "held-out"
+        self, paths: Sequence[Place], topic: str | None, folds: int, seed: int, on: str = "held-out"
     ) -> None:
         """Read the labels."""
         if on not in ("held-out", "train"):
@@ -155,7 +155,7 @@ class DataSet:
                 ]
 
 
-def _check_labels(path: Path, labels: Sequence[Label]) -> None:
+def _check_labels(path: Place, labels: Sequence[Label]) -> None:
     if not labels:
         raise InputError(f"{path}: has no labelled samples; `streamfeat convert` writes labels")
     missing = [i for i, label in enumerate(labels) if not label.label]

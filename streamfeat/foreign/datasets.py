@@ -16,6 +16,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.foreign.event_files import EXTENSIONS, open_events
+from streamfeat.places import Location, Place, fetched, files_below, is_folder, place_of
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label
 
@@ -38,7 +39,7 @@ _HELD_IN_MEMORY = 8 << 20  # bytes of a file, at most 96 times that in events; l
 class SamplePath:
     """One sample: its file, class, split ("" where no folder names one) and relative path."""
 
-    path: Path
+    path: Place
     label: str
     split: str
     source: str
@@ -54,8 +55,8 @@ class Conversion:
 
     samples: int
     events: int
-    failed: list[tuple[Path, str]]
-    damaged: list[tuple[Path, str]]
+    failed: list[tuple[Place, str]]
+    damaged: list[tuple[Place, str]]
     bytes_in: int
     bytes_out: int
 
@@ -89,7 +90,7 @@ class _Measured:
     last_us: int
 
 
-def find_samples(folder: str | Path) -> list[SamplePath]:
+def find_samples(folder: str | Path | Location) -> list[SamplePath]:
     """Find the labelled samples of a data set folder.
 
     A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
@@ -97,27 +98,29 @@ def find_samples(folder: str | Path) -> list[SamplePath]:
     split; `folder` itself counts. Hidden files, folders of annotations, and files without a label are passed
     over.
 
+    Args:
+        folder: or its URL.
+
     Returns:
         Samples sorted by `source`, their path relative to `folder` with forward slashes.
 
     Raises:
         InputError: there is no such folder, or no sample in it.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
+    folder = place_of(folder)
+    if not is_folder(folder):
         raise InputError(f"{folder}: is no folder")
     samples = []
-    for path in folder.rglob("*"):
-        *above, _ = parts = path.relative_to(folder).parts
+    name = folder.name if isinstance(folder, Location) else folder.resolve().name
+    for path, source in _files(folder):
+        *above, _ = parts = source.split("/")
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
-        # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
-        is_there = path.is_file() or (path.is_symlink() and not path.exists())
-        if hidden or path.suffix.lower() not in EXTENSIONS or not above or not is_there:
+        if hidden or path.suffix.lower() not in EXTENSIONS or not above:
             continue
         if len(above) == 1 and _split_of(above[0]):
             continue  # a file right inside a split has no label
-        split = next(filter(None, map(_split_of, [*above[-2::-1], folder.resolve().name])), "")
-        samples.append(SamplePath(path, above[-1], split, "/".join(parts)))
+        split = next(filter(None, map(_split_of, [*above[-2::-1], name])), "")
+        samples.append(SamplePath(path, above[-1], split, source))
     if not samples:
         raise InputError(
             f"{folder}: holds no samples; expected LABEL/FILE or SPLIT/LABEL/FILE with files ending in "
@@ -126,9 +129,21 @@ def find_samples(folder: str | Path) -> list[SamplePath]:
     return sorted(samples, key=lambda sample: sample.source)
 
 
+def _files(folder: Place) -> Iterable[tuple[Place, str]]:
+    """Files in a folder, however deep, each with its path from there."""
+    if isinstance(folder, Location):
+        return files_below(folder)
+    # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
+    return (
+        (path, path.relative_to(folder).as_posix())
+        for path in folder.rglob("*")
+        if path.is_file() or (path.is_symlink() and not path.exists())
+    )
+
+
 def convert(
-    source: str | Path,
-    out: str | Path,
+    source: str | Path | Location,
+    out: str | Path | Location,
     *,
     overwrite: bool = False,
     gap_us: int = 1_000_000,
@@ -147,9 +162,11 @@ def convert(
     the nominal duration of its data set, or to its last event where that is later or nothing is nominal.
     A single file keeps its times and has no label.
 
+    Of a source in a store one file at a time is fetched; one that is not given ends the conversion.
+
     Args:
-        source: the folder or file.
-        out: the recording to write. It appears only when all is written.
+        source: the folder or file, or its URL.
+        out: the recording to write, a local file. It appears only when all is written.
         overwrite: replace `out` where it exists.
         gap_us: silence between samples in microseconds, positive; at least one window of the encoder to be.
         split: name for the split of all samples, instead of what their folders say.
@@ -163,18 +180,19 @@ def convert(
     Raises:
         InputError: `source` cannot be read at all, `out` cannot be written, or an argument is out of range.
     """
-    source, out = Path(source), Path(out)
+    source, out = place_of(source), place_of(out)
+    if isinstance(out, Location):
+        raise InputError(f"{out}: recordings are written to local files; give one, and copy it to the store")
     if gap_us <= 0 or (limit is not None and limit <= 0) or (split_every is not None and split_every < 2):
         raise InputError("gap_us and limit must be positive, split_every at least 2")
     if split is not None and split_every is not None:
         raise InputError("split and split_every exclude each other; give one")
-    if not source.is_dir():
+    if not is_folder(source):
         with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
-            n, damage = _write_file(source, writer)
+            n, damage, bytes_in = _write_file(source, writer)
         if progress:
             progress(1, 1)
-        damaged = [(source, damage)] if damage else []
-        return Conversion(0, n, [], damaged, source.stat().st_size, out.stat().st_size)
+        return Conversion(0, n, [], [(source, damage)] if damage else [], bytes_in, out.stat().st_size)
     samples = find_samples(source)
     data_set = _recognise(samples)
     if split_every is not None:
@@ -188,11 +206,20 @@ def convert(
     return replace(done, bytes_out=out.stat().st_size)
 
 
-def _write_file(path: Path, writer: RecordingWriter) -> tuple[int, str]:
-    """Write one file as it is; return its number of events and its damage."""
-    file, damage = _measure(path, None)
-    _write_events(path, file, 0, writer)
-    return file.n, damage
+def _write_file(place: Place, writer: RecordingWriter) -> tuple[int, str, int]:
+    """Write one file as it is; return its number of events, its damage and its bytes."""
+    with fetched(place) as path:
+        try:
+            file, damage = _measure(path, None)
+            _write_events(path, file, 0, writer)
+        except InputError as error:
+            raise InputError(_of_place(error, path, place)) from error
+        return file.n, damage, path.stat().st_size
+
+
+def _of_place(error: InputError, path: Path, place: Place) -> str:
+    """What is wrong with a file, by the name that its user knows."""
+    return str(error).replace(str(path), str(place))
 
 
 def _write_events(path: Path, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
@@ -215,23 +242,24 @@ def _write_samples(
     failed, damaged = [], []
     n_events, bytes_in, start_us = 0, 0, gap_us
     for done, sample in enumerate(samples, 1):
-        try:
-            file, damage = _measure(sample.path, data_set)
-            origin_us = 0 if data_set else file.first_us
-            if file.last_us - origin_us >= _LONGEST_SAMPLE_US:
-                raise InputError(f"{sample.path}: lasts to {file.last_us} us, longer than an hour; damaged?")
-        except InputError as error:
-            failed.append((sample.path, str(error)))
-        else:
-            nominal_us = data_set.duration_us if data_set else 0
-            duration_us = max(nominal_us, file.last_us - origin_us + 1)
-            writer.write_label(Label(start_us, duration_us, sample.label, sample.split, sample.source))
-            _write_events(sample.path, file, start_us - origin_us, writer)
-            start_us += duration_us + gap_us
-            n_events += file.n
-            bytes_in += sample.path.stat().st_size
-            if damage:
-                damaged.append((sample.path, damage))
+        with fetched(sample.path) as path:
+            try:
+                file, damage = _measure(path, data_set)
+                origin_us = 0 if data_set else file.first_us
+                if file.last_us - origin_us >= _LONGEST_SAMPLE_US:
+                    raise InputError(f"{path}: lasts to {file.last_us} us, longer than an hour; damaged?")
+            except InputError as error:
+                failed.append((sample.path, _of_place(error, path, sample.path)))
+            else:
+                nominal_us = data_set.duration_us if data_set else 0
+                duration_us = max(nominal_us, file.last_us - origin_us + 1)
+                writer.write_label(Label(start_us, duration_us, sample.label, sample.split, sample.source))
+                _write_events(path, file, start_us - origin_us, writer)
+                start_us += duration_us + gap_us
+                n_events += file.n
+                bytes_in += path.stat().st_size
+                if damage:
+                    damaged.append((sample.path, damage))
         if progress:
             progress(done, len(samples))
     if len(failed) == len(samples):

@@ -21,6 +21,7 @@ from streamfeat.latency.hop import hop
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
 from streamfeat.machine import Disturbance, describe_machine
+from streamfeat.places import Place
 from streamfeat.recording import Label, Packet, Recording, open_recording
 from streamfeat.replay import items_of_split
 
@@ -97,7 +98,7 @@ class LatencyReport:
 
     def __init__(
         self,
-        recording: Path,
+        recording: Place,
         models: Sequence[Path],
         emits: Sequence[str],
         *,

@@ -20,6 +20,7 @@ from streamfeat.live.publisher import CameraSink
 from streamfeat.messages import EventPacket, LabelMessage
 from streamfeat.packets import Label, Packet, PacketWriter
 from streamfeat.pipeline import Pipeline, run_until_interrupted
+from streamfeat.places import Place
 from streamfeat.recording import open_recording
 from streamfeat.sinks import open_sinks
 
@@ -48,7 +49,7 @@ class Publish:
 
     def __init__(
         self,
-        sources: list[tuple[Path, str]],
+        sources: list[tuple[Place, str]],
         names: Names,
         *,
         speed: float | None = 1.0,

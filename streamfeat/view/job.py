@@ -20,6 +20,7 @@ from streamfeat.errors import InputError
 from streamfeat.files import replacing, write_atomically
 from streamfeat.live.listen import Listen
 from streamfeat.live.names import Names, beside
+from streamfeat.places import Place
 from streamfeat.replay import Replay, warm_up
 from streamfeat.view.channels import Board, FileBoard, LiveBoard
 from streamfeat.view.layout import foxglove_layout
@@ -59,7 +60,7 @@ class View:
 
     def __init__(
         self,
-        source: Path | Names,
+        source: Place | Names,
         model: Path,
         classifier: Path | None = None,
         *,
@@ -78,7 +79,7 @@ class View:
         self._live_port, self._web_port, self._recording_out = live_port, web_port, recording_out
         self._say = say
         self._looked, self._stopped = Event(), Event()
-        self._is_recording = isinstance(source, Path)
+        self._is_recording = isinstance(source, Place)
         self._boards: list[Board] = []
         self._sink = ViewSink(
             self._boards,
@@ -91,7 +92,7 @@ class View:
         common = {"model": model, "classifier": classifier, "emit": emit} | options
         self._job: Replay | Listen = (
             Replay(source, engine=self._engine_of(""), **common)
-            if isinstance(source, Path)
+            if isinstance(source, Place)
             else Listen(source, engine_of=self._engine_of, **common)
         )
         self._labels = Classifier.load(classifier).labels if classifier else ()
