@@ -8,6 +8,7 @@ scheduler: what a worker that dies has held is computed again on another from th
 """
 
 import platform
+import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from streamfeat.workers import Sums, add_sums, one_blas_thread
 
 try:
     import dask
-    from distributed import Client, Future, LocalCluster, get_worker
+    from distributed import Client, Event, Future, LocalCluster, get_client, get_worker, secede, wait
     from distributed.client import FutureCancelledError
     from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
@@ -69,9 +70,10 @@ class Cluster:
             _check(self._versions, found["packages"], address)
 
     @property
-    def dashboard(self) -> str:
-        """Where the engine shows what it does."""
-        return str(self._client.dashboard_link)
+    def description(self) -> str:
+        """How many work, and where Dask shows what they do."""
+        threads = self._client.nthreads().values()
+        return f"{len(threads)} workers, {sum(threads)} threads; dashboard: {self._client.dashboard_link}"
 
     def map(
         self, function: Callable[..., R], pieces: Iterable[tuple[Any, ...]], *common: Any
@@ -127,9 +129,111 @@ class Cluster:
     def _sum(self, parts: Sequence[Future]) -> Future:
         return self._client.submit(add_sums, *parts, pure=False, priority=1)
 
+    def errands(self, on_told: "Callable[[str, str, dict[str, Any]], None]") -> "Errands":
+        """Work that lasts until somebody ends it; see `Errands`."""
+        return Errands(self._client, self._versions, on_told)
+
     def _submit(self, function: Callable[..., R], *values: Any) -> Future:
         # A piece that cannot be read on one machine may be read on another.
         return self._client.submit(_worked, self._versions, function, *values, pure=False, retries=2)
+
+
+class Errands:
+    """Functions that run on workers until they are ended; one whose worker dies begins again on another.
+
+    Args:
+        client: connected.
+        versions: of all that decides what comes out.
+        on_told: called from a thread with an errand's name, its worker's address and what it told.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        versions: dict[str, str],
+        on_told: Callable[[str, str, dict[str, Any]], None],
+    ) -> None:
+        """Hear what errands tell."""
+        self._client, self._versions = client, versions
+        self._id = f"streamfeat-{uuid.uuid4()}"
+        self._futures: dict[str, Future] = {}
+        self._end = Event(self._id, client=client)
+        client.subscribe_topic(self._id, lambda event: on_told(*event[1]))
+
+    def begin(self, name: str, function: Callable[..., Any], *values: Any) -> None:
+        """Run `function(errand, *values)` on some worker, with an `Errand`.
+
+        Args:
+            name: of the errand; one that has begun is not begun again.
+            function: of a module; what it returns is told as the last.
+            values: small.
+        """
+        if name not in self._futures:
+            given = self._versions, self._id, name, function, *values
+            self._futures[name] = self._client.submit(_errand, *given, pure=False)
+
+    def check(self) -> dict[str, str]:
+        """Why errands failed that were not ended, by name; those whose workers all died are begun again."""
+        failed = {name: future for name, future in self._futures.items() if future.status == "error"}
+        found = {}
+        for name, future in failed.items():
+            try:
+                with _one_line():
+                    future.result()
+            except InputError as error:
+                found[name] = str(error)
+                if isinstance(error.__cause__, KilledWorker):
+                    future.retry()
+                else:
+                    del self._futures[name]
+        return found
+
+    def end(self, timeout_s: float = 20.0) -> None:
+        """End all errands, and wait until they have."""
+        with _one_line():
+            self._end.set()
+            with self._client.as_current():
+                wait(list(self._futures.values()), timeout=timeout_s)
+            self._client.unsubscribe_topic(self._id)
+
+
+class Errand:
+    """What a function that runs as an errand is given.
+
+    Args:
+        run_id: of the errands that it is one of.
+        name: its own.
+    """
+
+    def __init__(self, run_id: str, name: str) -> None:
+        """On a worker, in the thread of a task."""
+        self._worker = get_worker()
+        self._key = self._worker.get_current_task()
+        self._id, self._name = run_id, name
+        self._end = Event(run_id, client=get_client())
+
+    def is_wanted(self) -> bool:
+        """Whether nobody has ended it: neither whoever began it, nor the scheduler, nor the loss of both."""
+        task = self._worker.state.tasks.get(self._key)
+        if task is None or task.state == "cancelled":
+            return False
+        try:
+            return not self._end.is_set()
+        except (OSError, TimeoutError):
+            return False
+
+    def tell(self, what: dict[str, Any]) -> None:
+        """Tell whoever began it."""
+        self._worker.log_event(self._id, (self._name, self._worker.address, what))
+
+
+def _errand(
+    versions: dict[str, str], run_id: str, name: str, function: Callable[..., Any], *values: Any
+) -> None:
+    _check(versions, _versions(), get_worker().address)
+    errand = Errand(run_id, name)
+    secede()  # a worker has room for many: they wait most of the time
+    errand.tell(function(errand, *values))
 
 
 @contextmanager
@@ -220,8 +324,12 @@ def _one_line() -> Iterator[None]:
             f"work was given up after {error.allowed_failures + 1} workers died of it or while they did it; "
             "their logs tell why (too little memory?)"
         ) from error
-    except ModuleNotFoundError as error:
-        raise InputError(f"a worker lacks a package: {error}; install the same there as here") from error
+    except (ModuleNotFoundError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "deserialization" not in str(error):
+            raise
+        raise InputError(
+            f"a worker or the scheduler lacks a package: {_reason(error)}; install the same there as here"
+        ) from error
     except (FutureCancelledError, CommClosedError, TimeoutError) as error:
         raise InputError(f"the cluster is lost: {_reason(error)}") from error
 

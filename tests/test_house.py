@@ -43,7 +43,7 @@ LAYERS = [
     {"recording"},
     {"window", "recorder", "emission"},
     {"encoder", "sinks", "report", "table", "terminal_view"},
-    {"engine", "classifier", "features", "foreign", "learn"},
+    {"cluster", "engine", "classifier", "features", "foreign", "learn"},
     {"moment"},
     {"session"},
     {"cameras", "pipeline"},
@@ -76,6 +76,7 @@ ROOMS = {
         {"health", "network", "publisher"},
         {"keep", "screen"},
         {"listen", "publish", "record"},
+        {"spread"},
     ],
     "evaluate": [
         {"plan", "published", "scores", "splits", "surfaces"},
@@ -114,6 +115,8 @@ ONLY_IN = {
     "bokeh": {"report", "evaluate.page", "latency.picture"},
     "matplotlib": {"latency.picture"},
     "pyarrow": {"table"},
+    "dask": {"cluster"},
+    "distributed": {"cluster"},
     "foxglove": {"view.channels"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch", "doctor"},
 }

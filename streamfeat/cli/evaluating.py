@@ -17,17 +17,20 @@ from rich.table import Table
 
 from streamfeat.cli import options
 from streamfeat.cli.program import (
+    ClusterOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
     RecordingsArgument,
     StepsOption,
     TopicOption,
+    WorkersOption,
     app,
     err,
     out,
     progress_bars,
     refuse_existing,
+    working,
 )
 from streamfeat.errors import InputError
 
@@ -89,6 +92,8 @@ def evaluate(
     ] = None,
     page: Annotated[Path | None, typer.Option("--report", help="Page to write, .html; extra `plot`.")] = None,
     topic: TopicOption = None,
+    cluster: ClusterOption = None,
+    workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -116,7 +121,10 @@ def evaluate(
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
-        with progress_bars(quiet=quiet, as_lines=verbose) as report:
+        with (
+            working(cluster, workers, quiet=quiet) as place,
+            progress_bars(quiet=quiet, as_lines=verbose) as report,
+        ):
             report("reading labels", 0, 0, "")
             data = DataSet(recordings, topic, folds, Trial(**base).seed, on)
             report("reading labels", 1, 1, "")
@@ -126,6 +134,7 @@ def evaluate(
                 early_samples=early_samples,
                 state=state_path(output) if output else None,
                 report=report,
+                workers=place,
                 finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:

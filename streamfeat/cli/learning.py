@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from streamfeat.cli import options
 from streamfeat.cli.program import (
+    ClusterOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
@@ -22,12 +23,14 @@ from streamfeat.cli.program import (
     RecordingsArgument,
     StepsOption,
     TopicOption,
+    WorkersOption,
     app,
     err,
     print_losses,
     print_result,
     progress_bars,
     refuse_existing,
+    working,
 )
 from streamfeat.errors import InputError
 
@@ -69,6 +72,8 @@ def learn(
         typer.Option(help="Go on from this model; recordings and all other options as it was learned with."),
     ] = None,
     topic: TopicOption = None,
+    cluster: ClusterOption = None,
+    workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -89,9 +94,13 @@ def learn(
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
     try:
-        with contextlib.ExitStack() as files, progress_bars(quiet=quiet, as_lines=verbose) as report:
+        with contextlib.ExitStack() as files:
             opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
-            encoder = learn_encoder(opened, setting, resume=before, report=report, keep=_keeper(part))
+            place = files.enter_context(working(cluster, workers, quiet=quiet))
+            report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
+            encoder = learn_encoder(
+                opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
+            )
     except KeyboardInterrupt:
         err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
         raise typer.Exit(130) from None
@@ -152,6 +161,8 @@ def train(
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     mirror: options.Mirror = False,
     topic: TopicOption = None,
+    cluster: ClusterOption = None,
+    workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -165,15 +176,17 @@ def train(
 
     refuse_existing(classifier, overwrite=overwrite)
     encoder = Encoder.load(model)
-    with contextlib.ExitStack() as files, progress_bars(quiet=quiet, as_lines=verbose) as report:
+    with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
         for rec in opened:
-            if not rec.labels:
+            if not rec.is_labelled:
                 raise InputError(f"{rec.path}: has no labelled samples; `streamfeat convert` writes labels")
-        samples = encode_recordings(encoder, opened, report)
+        place = files.enter_context(working(cluster, workers, quiet=quiet))
+        report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
+        samples = encode_recordings(encoder, opened, report, workers=place)
         if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
-        images = encode_recordings(encoder, opened, report, mirror=True) if mirror else None
+        images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
         report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, images)
         trained = train_classifier(

@@ -5,18 +5,21 @@ Not here: the jobs (`live`).
 """
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from streamfeat.cli.program import (
     AnyPlace,
+    ClusterOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     VerboseOption,
+    WorkersOption,
     app,
     err,
     out,
@@ -24,6 +27,7 @@ from streamfeat.cli.program import (
     print_result,
     progress_bars,
     refuse_existing,
+    working,
 )
 from streamfeat.errors import InputError
 from streamfeat.places import place_of
@@ -94,11 +98,16 @@ def listen(
     ] = 1.0,
     state: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Keep what is needed to go on after a crash in this file."),
+        typer.Option(
+            metavar="FILE",
+            help="Keep what is needed to go on after a crash in this file; with --cluster a folder.",
+        ),
     ] = None,
     metrics: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
     ] = None,
+    cluster: ClusterOption = None,
+    workers: WorkersOption = None,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     overwrite: OverwriteOption = False,
@@ -113,20 +122,24 @@ def listen(
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
     names = names_of(key, ros2, domain)
-    job = Listen(
-        names,
-        model,
-        classifier,
-        emit=emit,
-        learn_online=learn_online,
-        reliable=reliable,
-        zenoh_config=zenoh_config,
-        port=port,
-        metrics=metrics,
-        max_delay_s=max_delay,
-        state=state,
-        console=err,
-    )
+    common: dict[str, Any] = {
+        "emit": emit,
+        "learn_online": learn_online,
+        "reliable": reliable,
+        "zenoh_config": zenoh_config,
+        "port": port,
+        "max_delay_s": max_delay,
+        "state": state,
+    }
+    if cluster is not None or workers is not None:
+        if output or json_lines or table or metrics:
+            raise InputError(
+                "on a cluster features and predictions go to the network: leave out --output, --json-lines, "
+                "--table and --metrics, or record them with `streamfeat record`"
+            )
+        _spread(names, model, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
+        return
+    job = Listen(names, model, classifier, metrics=metrics, console=err, **common)
     to_terminal = str(json_lines) == "-"
     job.run(
         console=None if quiet or as_json or to_terminal else out,
@@ -138,6 +151,31 @@ def listen(
     )
     if not to_terminal:
         print_result(job.result(), "heard", as_json=as_json)
+
+
+def _spread(
+    names: "Names",
+    model: Path,
+    classifier: Path | None,
+    common: dict[str, Any],
+    cluster: str | None,
+    workers: int | None,
+    *,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """`listen` on the workers of a cluster."""
+    from streamfeat.live.spread import Spread
+
+    with working(cluster, workers, quiet=quiet) as place:
+        say = (lambda line: None) if quiet else partial(err.print, markup=False, soft_wrap=True)
+        job = Spread(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
+        job.run()
+    result = job.result()
+    of_each = result.pop("of_each")
+    if as_json:
+        result["of_each"] = of_each
+    print_result(result, names.expression, as_json=as_json)
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")

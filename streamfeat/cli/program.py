@@ -33,9 +33,11 @@ from streamfeat.places import Place, place_of
 
 if TYPE_CHECKING:
     from streamfeat.mcap_records import Losses
+    from streamfeat.workers import Workers
 
 __all__ = [
     "AnyPlace",
+    "ClusterOption",
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
@@ -45,6 +47,7 @@ __all__ = [
     "StepsOption",
     "TopicOption",
     "VerboseOption",
+    "WorkersOption",
     "app",
     "err",
     "out",
@@ -52,6 +55,7 @@ __all__ = [
     "print_result",
     "progress_bars",
     "refuse_existing",
+    "working",
 ]
 
 _ORDER = ("demo", "info", "convert", "learn", "train", "replay", "evaluate", "latency", "view")
@@ -106,6 +110,14 @@ StepsOption = Annotated[
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 
+
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Work on the cluster of this Dask scheduler; extra `cluster`."),
+]
+WorkersOption = Annotated[
+    int | None, typer.Option(help="Work in so many processes of this machine; extra `cluster`.")
+]
 
 _NARROW = 90
 """Columns below which bars are short, so that rate and time left stay in sight."""
@@ -188,6 +200,28 @@ def _lines() -> Report:
             err.print(f"{escape(step)}{count}  [dim]{escape(remark)}[/]", soft_wrap=True)
 
     return report
+
+
+@contextlib.contextmanager
+def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterator["Workers"]:
+    """Where the options say that work is done: this process, or a cluster that is left at the end.
+
+    Raises:
+        InputError: both are given, the extra is not installed, or the cluster cannot be used.
+    """
+    from streamfeat.workers import HERE
+
+    if cluster is None and workers is None:
+        yield HERE
+        return
+    if cluster is not None and workers is not None:
+        raise InputError("--cluster and --workers exclude each other; give one")
+    from streamfeat.cluster import connected, local
+
+    with connected(cluster) if cluster is not None else local(workers or 0) as found:
+        if not quiet:
+            err.print(f"[dim]{found.description}[/]", soft_wrap=True)
+        yield found
 
 
 def print_losses(losses: "Losses") -> None:

@@ -11,16 +11,19 @@ from rich.markup import escape
 
 from streamfeat.cli.program import (
     AnyPlace,
+    ClusterOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
     RecordingArgument,
     TopicOption,
+    WorkersOption,
     app,
     err,
     print_losses,
     print_result,
     progress_bars,
+    working,
 )
 from streamfeat.errors import InputError
 from streamfeat.places import place_of
@@ -83,6 +86,8 @@ def convert(
     gap_ms: Annotated[float, typer.Option(help="Silence between samples; at least one window.")] = 1000.0,
     encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
     compression: Annotated[str, typer.Option(help="Chunks: zstd, lz4 or none.")] = "zstd",
+    cluster: ClusterOption = None,
+    workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="List every file with a fault.")] = False,
@@ -96,7 +101,7 @@ def convert(
 
     if not 0 < gap_ms < 1e9:
         raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
-    with progress_bars(quiet=quiet) as report:
+    with working(cluster, workers, quiet=quiet) as place, progress_bars(quiet=quiet) as report:
         done = datasets.convert(
             source,
             target,
@@ -108,6 +113,7 @@ def convert(
             compression=compression,  # type: ignore[arg-type]
             limit=limit,
             progress=lambda n, total: report("converting", n, total, ""),
+            workers=place,
         )
     result: dict[str, Any] = {
         "written": str(target),

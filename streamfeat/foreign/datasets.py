@@ -4,6 +4,7 @@ Lives here: the folder layouts of data sets, where samples stand in time, and th
 Not here: the formats of single files (`event_files`) and MCAP itself (`streamfeat.recorder`).
 """
 
+import contextlib
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +20,7 @@ from streamfeat.foreign.event_files import EXTENSIONS, open_events
 from streamfeat.places import Location, Place, fetched, files_below, is_folder, place_of
 from streamfeat.recorder import RecordingWriter
 from streamfeat.recording import Label
+from streamfeat.workers import HERE, Workers
 
 __all__ = ["Conversion", "SamplePath", "convert", "find_samples"]
 
@@ -32,7 +34,7 @@ _SPLITS = {
     "validation": "validation",
 }
 _LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
-_HELD_IN_MEMORY = 8 << 20  # bytes of a file, at most 96 times that in events; larger files are read twice
+_HELD_IN_MEMORY = 2 << 20  # bytes of a file, at most 96 times that in events; larger files are read twice
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,19 @@ class _Measured:
     n: int
     first_us: int
     last_us: int
+
+
+_NOTHING = _Measured((), (1, 1), 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What became of reading one file, and its bytes."""
+
+    file: _Measured
+    damage: str = ""
+    size: int = 0
+    error: str = ""
 
 
 def find_samples(folder: str | Path | Location) -> list[SamplePath]:
@@ -153,6 +168,7 @@ def convert(
     compression: Literal["zstd", "lz4", "none"] = "zstd",
     limit: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    workers: Workers = HERE,
 ) -> Conversion:
     """Convert a data set folder, or one event file, to a recording.
 
@@ -176,6 +192,7 @@ def convert(
         compression: of the chunks, see `RecordingWriter`.
         limit: convert only so many samples, as many of each label as the others have.
         progress: called with samples done and samples in all, after each.
+        workers: read the files of a folder, but for large ones; the recording is written here.
 
     Raises:
         InputError: `source` cannot be read at all, `out` cannot be written, or an argument is out of range.
@@ -202,7 +219,7 @@ def convert(
     if limit is not None:
         samples = _spread(samples, limit)
     with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
-        done = _write_samples(samples, data_set, gap_us, writer, progress)
+        done = _write_samples(samples, data_set, gap_us, writer, progress, workers)
     return replace(done, bytes_out=out.stat().st_size)
 
 
@@ -222,7 +239,7 @@ def _of_place(error: InputError, path: Path, place: Place) -> str:
     return str(error).replace(str(path), str(place))
 
 
-def _write_events(path: Path, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
+def _write_events(path: Place, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
     for batch in file.batches:
         moved = batch.copy()
         moved["t"] += shift_us
@@ -238,33 +255,52 @@ def _write_samples(
     gap_us: int,
     writer: RecordingWriter,
     progress: Callable[[int, int], None] | None,
+    workers: Workers,
 ) -> Conversion:
     failed, damaged = [], []
     n_events, bytes_in, start_us = 0, 0, gap_us
-    for done, sample in enumerate(samples, 1):
-        with fetched(sample.path) as path:
-            try:
-                file, damage = _measure(path, data_set)
-                origin_us = 0 if data_set else file.first_us
-                if file.last_us - origin_us >= _LONGEST_SAMPLE_US:
-                    raise InputError(f"{path}: lasts to {file.last_us} us, longer than an hour; damaged?")
-            except InputError as error:
-                failed.append((sample.path, _of_place(error, path, sample.path)))
+    looks = workers.map(_look, ((sample.path, data_set) for sample in samples))
+    for done, (sample, look) in enumerate(zip(samples, looks, strict=True), 1):
+        with contextlib.ExitStack() as copies:
+            if look is None:  # it is large
+                path = copies.enter_context(fetched(sample.path))
+                look = _look_at(path, sample.path, data_set)
+            if look.error:
+                failed.append((sample.path, look.error))
             else:
+                origin_us, file = 0 if data_set else look.file.first_us, look.file
                 nominal_us = data_set.duration_us if data_set else 0
                 duration_us = max(nominal_us, file.last_us - origin_us + 1)
                 writer.write_label(Label(start_us, duration_us, sample.label, sample.split, sample.source))
-                _write_events(path, file, start_us - origin_us, writer)
+                _write_events(sample.path, file, start_us - origin_us, writer)
                 start_us += duration_us + gap_us
                 n_events += file.n
-                bytes_in += path.stat().st_size
-                if damage:
-                    damaged.append((sample.path, damage))
+                bytes_in += look.size
+                if look.damage:
+                    damaged.append((sample.path, look.damage))
         if progress:
             progress(done, len(samples))
     if len(failed) == len(samples):
         raise InputError(f"none of the {len(samples)} samples can be read; the first: {failed[0][1]}")
     return Conversion(len(samples) - len(failed), n_events, failed, damaged, bytes_in, 0)
+
+
+def _look(place: Place, data_set: _DataSet | None) -> "_Look | None":
+    """Read a file, if it is small enough to be held."""
+    with fetched(place) as path:
+        is_large = path.exists() and path.stat().st_size > _HELD_IN_MEMORY
+        return None if is_large else _look_at(path, place, data_set)
+
+
+def _look_at(path: Path, place: Place, data_set: _DataSet | None) -> "_Look":
+    """Read a file, which is at `path` now."""
+    try:
+        file, damage = _measure(path, data_set)
+        if file.last_us - (0 if data_set else file.first_us) >= _LONGEST_SAMPLE_US:
+            raise InputError(f"{path}: lasts to {file.last_us} us, longer than an hour; damaged?")
+    except InputError as error:
+        return _Look(_NOTHING, error=_of_place(error, path, place))
+    return _Look(file, damage, path.stat().st_size)
 
 
 def _measure(path: Path, data_set: _DataSet | None) -> tuple[_Measured, str]:

@@ -106,6 +106,13 @@ class Names(Protocol):
     """How topics are called on the network."""
 
     @property
+    def expression(self) -> str:
+        """What the topics are called, perhaps with wildcards."""
+
+    def one(self, topic: str) -> "Names":
+        """The same for one topic."""
+
+    @property
     def subscriptions(self) -> list[str]:
         """Key expressions of the events, and of labels for them."""
 
@@ -142,6 +149,10 @@ class PlainNames:
     def tokens(self) -> str:
         """See `Names`."""
         return f"{self.expression}/{_TOKEN}/*"
+
+    def one(self, topic: str) -> "PlainNames":
+        """See `Names`."""
+        return PlainNames(topic)
 
     def schema(self, key: str, encoding: str) -> str | None:
         """See `Names`."""
@@ -196,6 +207,10 @@ class RosNames:
         """See `Names`."""
         # A topic is one chunk of a token, so wildcards within it cannot be told to zenoh.
         return f"{_ROS_TOKEN}/{self.domain}/*/*/*/MP/*/*/*/*/*/*/*"
+
+    def one(self, topic: str) -> "RosNames":
+        """See `Names`."""
+        return RosNames(topic, self.domain)
 
     def schema(self, key: str, encoding: str) -> str | None:
         """See `Names`."""

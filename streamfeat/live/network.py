@@ -11,6 +11,7 @@ the others through it. A ROS 2 router (`rmw_zenohd`) on this machine is found in
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +27,7 @@ from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
 from streamfeat.packets import EVENT_SCHEMAS
 
-__all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "find_topics", "open_session"]
+__all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "TopicWatch", "find_topics", "open_session"]
 
 DEFAULT_PORT = 7447
 _MAX_MESSAGE_BYTES = 16 << 20
@@ -216,6 +217,47 @@ class Subscription:
         if not tokens:
             del self._tokens[topic]
             self._inbox.put(Announcement(topic, here=False))
+
+
+class TopicWatch:
+    """Finds the topics that publishers announce, as long as it is open; a context manager.
+
+    Args:
+        session: open; not closed here.
+        names: of the topics.
+        on_topic: told each topic that is there or appears, perhaps several times, from a thread of zenoh.
+    """
+
+    def __init__(self, session: zenoh.Session, names: Names, on_topic: Callable[[str], None]) -> None:
+        """Start watching.
+
+        Raises:
+            InputError: zenoh refuses the key expression.
+        """
+        try:
+            wanted = zenoh.KeyExpr(names.expression.lstrip("/"))
+
+            def on_token(sample: zenoh.Sample) -> None:
+                topic = names.token_topic(str(sample.key_expr))
+                is_there = topic and sample.kind == zenoh.SampleKind.PUT
+                if is_there and wanted.intersects(zenoh.KeyExpr(topic.lstrip("/"))):
+                    on_topic(topic)
+
+            self._watching = session.liveliness().declare_subscriber(
+                names.tokens, Callback(on_token, indirect=False), history=True
+            )
+        except zenoh.ZError as error:
+            raise InputError(f"{names.expression!r} is no key expression: {_first_line(error)}") from None
+
+    def __enter__(self) -> Self:
+        """Give the watch itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop watching."""
+        self._watching.undeclare()  # type: ignore[no-untyped-call]
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -1,0 +1,223 @@
+"""The main job on live topics, on the workers of a cluster: each camera on one of them.
+
+Lives here: which cameras there are, what runs on a worker, and what all of them have done together.
+Not here: which worker serves a camera, and what takes over when that dies (`cluster`); zenoh brings the data
+straight to the worker.
+"""
+
+import contextlib
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import quote
+
+from streamfeat.cluster import Cluster, Errand
+from streamfeat.live.listen import Listen
+from streamfeat.live.names import Names
+from streamfeat.live.network import TopicWatch, open_session
+
+__all__ = ["Served", "Spread"]
+
+_TOLD_EVERY_S = 0.25
+_CHECK_EVERY_S = 0.5
+_COUNTS = ("packets", "events", "emissions", "samples", "lost", "dropped", "incomplete")
+
+
+@dataclass(slots=True)
+class Served:
+    """One camera, as far as its workers have told.
+
+    Attributes:
+        worker: address of the one that serves it now; empty if none has begun.
+        starts: how often a worker has begun to serve it.
+        past: counts of the workers before.
+        now: counts of this one, a quarter of a second old at most.
+        missed: packets that were published between the last that a dead worker told of and the first that the
+            next one heard; some of them the dead one may have read without telling.
+        first_unheard: packets that were published before the first worker heard any.
+    """
+
+    worker: str = ""
+    starts: int = 0
+    past: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_COUNTS, 0))
+    now: dict[str, int] = field(default_factory=dict)
+    missed: int = 0
+    first_unheard: int = 0
+    _published: int = 0
+
+    def hear(self, worker: str, told: dict[str, Any]) -> None:
+        """Take in what a worker tells."""
+        if told.get("begins"):
+            self.past = self.counts()
+            self._published = self._published_by(self.now)
+            self.now = {}
+            self.worker, self.starts = worker, self.starts + 1
+        else:
+            if not self.now.get("packets") and told["packets"]:
+                if self.starts == 1:
+                    self.first_unheard = told["unheard"]
+                else:
+                    self.missed += max(0, told["unheard"] - self._published)
+            self.now = told
+
+    def counts(self) -> dict[str, int]:
+        """All workers together."""
+        return {name: self.past[name] + self.now.get(name, 0) for name in _COUNTS}
+
+    @staticmethod
+    def _published_by(counts: dict[str, int]) -> int:
+        return sum(counts.get(name, 0) for name in ("packets", "unheard", "lost", "dropped"))
+
+
+class Spread:
+    """Listens on topics, each on some worker, until `stop` or a signal.
+
+    The files that are named here are sent to the workers with their contents.
+
+    Args:
+        names: of the topics. Those that a wildcard means are found by their publishers' tokens.
+        cluster: the workers.
+        model: of the encoder.
+        classifier: to predict with; none for features alone.
+        zenoh_config: JSON5 file, for this process and the workers; without it, each machine alone.
+        port: where sessions on one machine meet.
+        state: folder on the workers, best one that all of them see, for what a camera needs to go on after
+            its worker died; without it the next worker begins anew, and says what is incomplete.
+        say: told about workers, cameras and failures, in lines.
+        options: of `Listen`.
+
+    Raises:
+        InputError: as of `Listen`.
+    """
+
+    def __init__(
+        self,
+        names: Names,
+        cluster: Cluster,
+        model: Path,
+        classifier: Path | None = None,
+        *,
+        zenoh_config: Path | None = None,
+        port: int,
+        state: Path | None = None,
+        say: Callable[[str], None] = lambda line: None,
+        **options: Any,
+    ) -> None:
+        """Check everything but the network."""
+        given = {"model": model, "classifier": classifier, "zenoh_config": zenoh_config}
+        checked: dict[str, Any] = {**given, "port": port, **options}
+        Listen(names, **checked)
+        self._names, self._cluster, self._say = names, cluster, say
+        self._files = {name: path.read_bytes() for name, path in given.items() if path}
+        self._options = {"port": port, **options}
+        self._zenoh_config, self._port, self._state = zenoh_config, port, state
+        self._stopped = threading.Event()
+        self._lock = threading.Lock()
+        self.cameras: dict[str, Served] = {}
+        self.interrupted = False
+
+    def run(self) -> None:
+        """Serve until `stop`, SIGINT or SIGTERM.
+
+        Raises:
+            InputError: the network or the cluster cannot be used.
+        """
+        errands = self._cluster.errands(self._on_told)
+
+        def serve(topic: str) -> None:
+            with self._lock:
+                is_new = topic not in self.cameras
+                self.cameras.setdefault(topic, Served())
+            if is_new:
+                errands.begin(topic, _serve, self._names.one(topic), self._files, self._options, self._state)
+
+        with contextlib.ExitStack() as stack:
+            stack.callback(errands.end)
+            if "*" in self._names.expression:
+                session = stack.enter_context(open_session(self._zenoh_config, port=self._port))
+                stack.enter_context(TopicWatch(session, self._names, serve))
+            else:
+                serve(self._names.expression)
+            try:
+                while not self._stopped.wait(_CHECK_EVERY_S):
+                    for topic, reason in errands.check().items():
+                        self._say(f"{topic}: {reason}")
+            except KeyboardInterrupt:
+                self.interrupted = True
+
+    def stop(self) -> None:
+        """End it; may be called from any thread."""
+        self._stopped.set()
+
+    def result(self) -> dict[str, Any]:
+        """What happened, as JSON values."""
+        with self._lock:
+            cameras = {topic: (served, served.counts()) for topic, served in self.cameras.items()}
+        totals = {name: sum(counts[name] for _, counts in cameras.values()) for name in _COUNTS}
+        return {
+            "cameras": len(cameras),
+            **totals,
+            "missed": sum(served.missed for served, _ in cameras.values()),
+            "restarts": sum(max(0, served.starts - 1) for served, _ in cameras.values()),
+            "interrupted": self.interrupted,
+            "of_each": {
+                topic: counts | {"worker": served.worker, "starts": served.starts, "missed": served.missed}
+                for topic, (served, counts) in sorted(cameras.items())
+            },
+        }
+
+    def _on_told(self, topic: str, worker: str, told: dict[str, Any]) -> None:
+        with self._lock:
+            served = self.cameras[topic]
+            served.hear(worker, told)
+        if told.get("begins"):
+            self._say(f"{topic}: {'again ' if served.starts > 1 else ''}on worker {worker}")
+
+
+def _serve(
+    errand: Errand, names: Names, files: dict[str, bytes], options: dict[str, Any], state: Path | None
+) -> dict[str, Any]:
+    """Listen on one topic on a worker, until nobody wants it any more; what it has done."""
+    with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
+        given: dict[str, Any] = {**options}
+        for name, content in files.items():
+            given[name] = Path(folder, name)
+            given[name].write_bytes(content)
+        if state:
+            state.mkdir(parents=True, exist_ok=True)
+            given["state"] = state / quote(names.expression, safe="")
+        job = Listen(names, **given)
+        errand.tell({"begins": True})
+        with _Telling(errand, job):
+            job.run()
+        return job.result()
+
+
+class _Telling:
+    """Tells what a job has done so far, and stops it when nobody wants it; a context manager."""
+
+    def __init__(self, errand: Errand, job: Listen) -> None:
+        self._errand, self._job = errand, job
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="telling", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._over.wait(_TOLD_EVERY_S):
+            if not self._errand.is_wanted():
+                self._job.stop()
+                return
+            self._errand.tell(self._job.result())

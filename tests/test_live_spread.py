@@ -1,0 +1,162 @@
+"""Cameras on the workers of a cluster: each served by one, and by another when that dies."""
+
+import contextlib
+import os
+import signal
+import threading
+import time
+
+import pytest
+import tiny
+from live_net import Collector, compiled, free_port, running, until
+from test_live_listen import MODEL, message
+
+pytest.importorskip("distributed", reason="needs the extra `cluster`")
+
+from streamfeat.cluster import local
+from streamfeat.live.names import PlainNames, RosNames
+from streamfeat.live.network import TopicWatch, open_session
+from streamfeat.live.publisher import MessagePublisher
+from streamfeat.live.spread import Served, Spread
+from streamfeat.messages import EventPacket
+
+PACKET_US = 10_000
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    MODEL.save(folder / "model")
+    return compiled(folder) / "model"
+
+
+@pytest.fixture(scope="module")
+def two():
+    with local(2, 1) as cluster:
+        yield cluster
+
+
+class Camera:
+    """Publishes a packet every ten milliseconds until it is closed, and announces itself."""
+
+    def __init__(self, session, key):
+        self.sent = 0
+        self._publisher = MessagePublisher(session, PlainNames(key), key, EventPacket.SCHEMA_NAME, block=True)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        while not self._over.wait(PACKET_US / 1e6):
+            start = 1_000_000 + self.sent * PACKET_US
+            self._publisher.put(message(tiny.steady(start, start + PACKET_US, 50, self.sent), self.sent))
+            self.sent += 1
+
+    def close(self):
+        self._over.set()
+        self._thread.join()
+        self._publisher.close()
+
+
+@contextlib.contextmanager
+def cameras(session, keys):
+    with contextlib.ExitStack() as stack:
+        found = [Camera(session, key) for key in keys]
+        for camera in found:
+            stack.callback(camera.close)
+        yield found
+
+
+@pytest.mark.parametrize("keeps_state", [False, True])
+def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, keeps_state):
+    port, keys = free_port(), [f"robot/{i}/events" for i in range(4)]
+    state = tmp_path / "state" if keeps_state else None
+    lines = []
+    options = {"port": port, "emit": "10ms", "state": state, "say": lines.append}
+    job = Spread(PlainNames("robot/*/events"), two, model, **options)
+    with open_session(port=port) as session, running(job):
+        features = Collector(session, "robot/*/features")
+        with cameras(session, keys) as publishing:
+
+            def each_since(start):
+                return len({key for key, *_ in features.samples[start:]}) == len(keys)
+
+            until(lambda: each_since(0), lambda: f"features of each: {job.result()}")
+            until(lambda: all(one.now.get("packets") for one in job.cameras.values()), "counts of each")
+            addresses = {one.worker for one in job.cameras.values()}
+            assert len(addresses) == 2, "the cameras are spread"
+            pids = two._client.run(os.getpid)
+            victim = sorted(addresses)[0]
+            mourned = [topic for topic, one in job.cameras.items() if one.worker == victim]
+            os.kill(pids[victim], signal.SIGKILL)
+            until(lambda: all(job.cameras[topic].starts == 2 for topic in mourned), "others in their place")
+            start = len(features.samples)
+            until(lambda: each_since(start), lambda: f"features of each again: {job.result()}")
+            until(lambda: all(job.cameras[topic].now.get("packets") for topic in mourned), "their counts")
+        time.sleep(0.5)
+    result = job.result()
+    assert (result["cameras"], result["restarts"]) == (4, len(mourned))
+    for camera, key in zip(publishing, keys, strict=True):
+        one = result["of_each"][key]
+        counted = one["packets"] + one["lost"] + one["dropped"] + one["missed"]
+        first = job.cameras[key].first_unheard
+        assert counted + first >= camera.sent
+        assert one["starts"] == (2 if key in mourned else 1)
+        assert bool(one["missed"] + one["lost"]) == (key in mourned)
+    if keeps_state:
+        assert len(list(state.iterdir())) == 4
+    assert len([line for line in lines if "again on worker" in line]) == len(mourned)
+
+
+def test_topics_are_found_by_their_tokens_alone():
+    port, found = free_port(), []
+    with (
+        open_session(port=port) as session,
+        open_session(port=port) as other,
+        TopicWatch(session, PlainNames("a/*/events"), found.append),
+    ):
+        with cameras(other, ["a/1/events", "b/1/events", "a/2/events"]):
+            until(lambda: set(found) == {"a/1/events", "a/2/events"})
+        names, ros = RosNames("/cam$*/events", 3), []
+        with TopicWatch(session, names, ros.append):
+            for topic in ("/cam1/events", "/cat/events", "/cam2/events"):
+                MessagePublisher(other, RosNames(topic, 3), topic, EventPacket.SCHEMA_NAME)
+            until(lambda: set(ros) == {"/cam1/events", "/cam2/events"})
+
+
+def test_one_camera_without_a_wildcard_needs_no_token(two, model):
+    port = free_port()
+    job = Spread(PlainNames("robot/0/events"), two, model, port=port, emit="10ms")
+    with open_session(port=port) as session, running(job):
+        publisher = session.declare_publisher("robot/0/events")
+        until(lambda: publisher.matching_status.matching, "a subscriber")
+        publisher.put(message(tiny.steady(0, PACKET_US, 50), 0))
+        until(lambda: job.result()["packets"] == 1, lambda: f"{job.result()}")
+    assert job.result()["of_each"]["robot/0/events"]["starts"] == 1
+
+
+def test_what_a_dead_worker_may_have_lost_is_counted():
+    one = Served()
+    one.hear("a", {"begins": True})
+    one.hear("a", {"packets": 10, "unheard": 5, "lost": 1, "dropped": 0, "events": 100})
+    one.hear("b", {"begins": True})
+    one.hear("b", {"packets": 0, "unheard": 0, "lost": 0, "dropped": 0, "events": 0})
+    one.hear("b", {"packets": 4, "unheard": 20, "lost": 0, "dropped": 0, "events": 40})
+    one.hear("b", {"packets": 6, "unheard": 20, "lost": 2, "dropped": 0, "events": 60})
+    assert (one.starts, one.worker, one.missed) == (2, "b", 4)
+    assert one.counts() | {"packets": 16, "events": 160, "lost": 3} == one.counts()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--workers", "1", "-o", "x.mcap"), "features and predictions go to the network"),
+        (("--workers", "0"), "0 workers cannot do anything"),
+        (("--cluster", "tcp://127.0.0.1:1", "--emit", "now"), "no scheduler answers"),
+    ],
+)
+def test_refusals_are_one_line(run, model, options, reason, monkeypatch):
+    monkeypatch.setattr("streamfeat.cluster._PATIENCE_S", 0.5)
+    result = run("listen", "a/*/events", "-m", model, *options)
+    assert (result.status, result.err.count("\n")) == (2, 1)
+    assert reason in result.err
