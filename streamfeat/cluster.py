@@ -89,7 +89,7 @@ class Cluster:
             ahead = deque(begin(n))
             try:
                 while ahead:
-                    yield ahead.popleft().result()
+                    yield self._result(ahead.popleft())
                     ahead.extend(begin(1))
             finally:
                 self._client.cancel(list(ahead))
@@ -104,7 +104,7 @@ class Cluster:
     def fetch(self, held: Sequence[Any]) -> list[Any]:
         """See `Workers`."""
         with _one_line():
-            return list(self._client.gather(list(held)))
+            return [self._result(one) for one in held]
 
     def total(self, function: Callable[..., Sums], held: Sequence[tuple[Any, ...]], *common: Any) -> Sums:
         """See `Workers`; sums are added on the workers, and those that can be are added first."""
@@ -118,13 +118,22 @@ class Cluster:
                     else group[0]
                     for group in groups
                 ]
-            sums: Sums = level[0].result()
+            sums: Sums = self._result(level[0])
             return sums
 
     def each(self, function: Callable[..., R], held: Sequence[tuple[Any, ...]], *common: Any) -> list[Any]:
         """See `Workers`."""
         with _one_line():
             return [self._submit(function, *values, *common) for values in held]
+
+    def _result(self, future: Future) -> Any:
+        """Wait for a result, as long as there is somebody to work on it."""
+        while True:
+            try:
+                return future.result(timeout=_PATIENCE_S)
+            except TimeoutError:
+                if future.status == "pending" and not self._client.nthreads():
+                    raise InputError("no worker is left; their logs tell why") from None
 
     def _sum(self, parts: Sequence[Future]) -> Future:
         return self._client.submit(add_sums, *parts, pure=False, priority=1)
