@@ -97,6 +97,10 @@ def listen(
     metrics: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="Serve one of N fixed shares of the cameras, I from 0 to N - 1."),
+    ] = None,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     overwrite: OverwriteOption = False,
@@ -106,6 +110,7 @@ def listen(
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
     from streamfeat.live.listen import Listen
+    from streamfeat.live.shard import Shard
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -123,6 +128,7 @@ def listen(
         metrics=metrics,
         max_delay_s=max_delay,
         state=state,
+        shard=Shard.parse(shard) if shard is not None else None,
         console=err,
     )
     to_terminal = str(json_lines) == "-"

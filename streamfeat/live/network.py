@@ -24,6 +24,7 @@ from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
+from streamfeat.live.shard import Shard
 from streamfeat.packets import EVENT_SCHEMAS
 
 __all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "find_topics", "open_session"]
@@ -114,9 +115,20 @@ class Subscription:
         inbox: filled.
         reliable: use zenoh's advanced subscriber, which recovers what was missed and asks for history; works
             with publishers that do the same.
+        shard: the cameras to hear; all others are left out, and their packets counted, before their bytes
+            are copied. They come over the network nevertheless: not every publisher announces itself, so
+            only the wildcard finds them all.
     """
 
-    def __init__(self, session: zenoh.Session, names: Names, inbox: Inbox, *, reliable: bool = False) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        names: Names,
+        inbox: Inbox,
+        *,
+        reliable: bool = False,
+        shard: Shard | None = None,
+    ) -> None:
         """Subscribe.
 
         Raises:
@@ -124,6 +136,7 @@ class Subscription:
         """
         self._names = names
         self._inbox = inbox
+        self._shard = shard
         self._tokens: dict[str, set[str]] = {}
         self._open: list[object] = []
         try:
@@ -185,6 +198,9 @@ class Subscription:
         topic = self._names.topic(key)
         if sample.kind != zenoh.SampleKind.PUT or topic.rpartition("/")[2] in OUTPUTS:
             return
+        if self._shard and not self._shard.has(topic):
+            self._inbox.leave()
+            return
         size = len(sample.payload)
         problem = "too large" if size > MAX_PAYLOAD_BYTES else ""
         attachment = sample.attachment
@@ -203,7 +219,7 @@ class Subscription:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         topic = self._names.token_topic(str(sample.key_expr))
-        if not topic:
+        if not topic or (self._shard and not self._shard.has(topic)):
             return
         # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
         tokens = self._tokens.setdefault(topic, set())
