@@ -1,9 +1,7 @@
 """What a process pays for the cameras of other shards, whose packets its wildcard brings along."""
 
-import os
 import time
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 from streamfeat.live.names import PlainNames
@@ -12,7 +10,7 @@ from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
 from streamfeat.machine import Disturbance
 from streamfeat.messages import EventPacket
-from tools.live_bench.processes import FRAME, KEY, counts, finish, listener, wait_for_reader
+from tools.live_bench.processes import FRAME, KEY, counts, cpu_seconds, finish, listener, wait_for_reader
 from tools.live_bench.rates import PACKET, ready_packets
 
 _RATE = 150
@@ -41,10 +39,10 @@ def _listening(arguments: Namespace, shard: str) -> dict[str, Any]:
         camera = MessagePublisher(session, PlainNames(KEY), KEY, EventPacket.SCHEMA_NAME, block=True)
         wait_for_reader(session, KEY)
         counts(metrics)
-        idle_s = _cpu_seconds(one.pid)
+        idle_s = cpu_seconds(one.pid)
         time.sleep(arguments.seconds)
-        idle_s = _cpu_seconds(one.pid) - idle_s
-        before_s, started, n = _cpu_seconds(one.pid), time.perf_counter(), 0
+        idle_s = cpu_seconds(one.pid) - idle_s
+        before_s, started, n = cpu_seconds(one.pid), time.perf_counter(), 0
         while (passed := time.perf_counter() - started) < arguments.seconds:
             if n >= passed * _RATE:
                 time.sleep(0.001)
@@ -56,7 +54,7 @@ def _listening(arguments: Namespace, shard: str) -> dict[str, Any]:
             n += 1
         while sum(counts(metrics).get(name, 0) for name in ("packets", "other_shards_packets")) < n - 1:
             time.sleep(0.1)
-        taken_s = _cpu_seconds(one.pid) - before_s
+        taken_s = cpu_seconds(one.pid) - before_s
         camera.close()
         result = finish(one)
     return {
@@ -67,8 +65,3 @@ def _listening(arguments: Namespace, shard: str) -> dict[str, Any]:
         "idle_core_share": round(idle_s / arguments.seconds, 4),
         "microseconds_per_packet": round(1e6 * (taken_s - idle_s) / n, 1),
     }
-
-
-def _cpu_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
