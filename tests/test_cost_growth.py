@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_net import free_port
 
 import streamfeat as sf
 from streamfeat.errors import InputError
@@ -110,30 +111,26 @@ def test_a_plan_adds_up(material):
 def test_the_tool_runs(tmp_path, monkeypatch, capsys):
     """As its README section says, but shorter; then a plan from its figures."""
     figures, picture = tmp_path / "growth.json", tmp_path / "growth.svg"
-    words = [
-        "cost_growth",
-        "-r",
-        RECORDING,
-        "--quick",
-        "--rounds",
-        "1",
-        "--events",
-        "1000",
-        "--json",
-        figures,
-    ]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-    tool.main()
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["cost_growth", "-r", *map(str, (RECORDING, *words))])
+        tool.main()
+        return capsys.readouterr().out
+
+    said = run("--quick", "--rounds", 1, "--events", 1000, "--port", free_port(), "--json", figures)
+    assert said.startswith("| reading | K |")
     report = json.loads(figures.read_text())
     assert len(report["rows"]) == 6
     assert all(row["ns"]["p50"] > 0 and row["predicted_ns"] > 0 for row in report["rows"])
     assert report["processes"]["1"]["events_per_processor_s"] > 0
-    assert capsys.readouterr().out.startswith("| reading | K |")
-    words = ["cost_growth", "-r", RECORDING, "--constants", figures, "--plan", "10,0.01,100"]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-    tool.main()
-    assert json.loads(capsys.readouterr().out)["cameras"] == 10
+    (one,) = report["fleet"]["rows"]
+    assert (one["cameras"], one["not_used"]) == (1, 0)
+    assert one["readings"] > 0
+    # What so short a run says of this machine is anybody's guess.
+    report |= {"constants": {"step_ns": 2.0, "byte_ns": 0.02}, "fleet": {"packet_us": 500.0}}
+    figures.write_text(json.dumps(report))
+    words = ["--constants", figures, "--plan", "10,0.01,100", "--resolution", "60x80"]
+    assert json.loads(run(*words))["cameras"] == 10
     pytest.importorskip("matplotlib", reason="the extra `plot` is not installed")
-    monkeypatch.setattr(sys, "argv", [*sys.argv, "--plot", str(picture)])
-    tool.main()
+    run(*words, "--plot", picture)
     assert picture.read_text().startswith("<?xml")
