@@ -96,9 +96,9 @@ def _together(arguments: argparse.Namespace, material: Material, constants: Cons
     """Processes beside each other, and cameras of one listener."""
     processes, cameras = ((1,), (1,)) if arguments.quick else ((1, 2), (1, 2, 4))
     seconds = min(arguments.seconds, 0.2) if arguments.quick else arguments.seconds
-    camera = Setting("10ms", rate=100_000)
+    camera, turns = Setting("10ms", rate=100_000), 1 if arguments.quick else 3
     return {
-        "fleet": measure_fleet(material, camera, cameras, seconds, constants, arguments.port),
+        "fleet": measure_fleet(material, camera, cameras, seconds, constants, arguments.port, turns),
         "processes": measure_processes(arguments.recording, Setting("10ms"), processes, seconds),
     }
 

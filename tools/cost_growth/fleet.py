@@ -9,6 +9,7 @@ import contextlib
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from streamfeat.live.names import PlainNames
@@ -35,6 +36,7 @@ def measure_fleet(
     seconds: float,
     constants: Constants,
     port: int,
+    turns: int = 3,
 ) -> dict[str, Any]:
     """Cores that one listener keeps busy with so many cameras.
 
@@ -44,29 +46,32 @@ def measure_fleet(
         material: what the cameras see.
         setting: one camera.
         counts: of cameras.
-        seconds: of each.
+        seconds: of each, in each turn.
         constants: what the engines cost.
         port: where sessions meet.
+        turns: of which medians are taken.
     """
     stream = Stream(material, setting, 20_000)
     engines = constants.predict(work_of(setting, stream)) * setting.rate / 1e9
-    disturbance, rows, packet_s = Disturbance(), [], None
-    for count in counts:
-        row = _listening(stream, setting, count, seconds, port)
-        if packet_s is None:
-            packet_s = max(row["cores"] / count - engines, 0.0) / PACKETS_PER_S
-        row["predicted_cores"] = count * (engines + packet_s * PACKETS_PER_S)
-        rows.append(row)
+    disturbance = Disturbance()
+    runs = [[_listening(stream, setting, count, seconds, port) for count in counts] for _ in range(turns)]
+    rows = [
+        {"cameras": count} | {name: median(run[i][name] for run in runs) for name in runs[0][i]}
+        for i, count in enumerate(counts)
+    ]
+    packet_s = max(rows[0]["cores"] / rows[0]["cameras"] - engines, 0.0) / PACKETS_PER_S
+    for row in rows:
+        row["predicted_cores"] = row["cameras"] * (engines + packet_s * PACKETS_PER_S)
     return {
         "setting": setting.name,
         "engine_cores_per_camera": engines,
-        "packet_us": 1e6 * (packet_s or 0.0),
+        "packet_us": 1e6 * packet_s,
         "rows": rows,
         "steal": disturbance.steal_share(),
     }
 
 
-def _listening(stream: Stream, setting: Setting, count: int, seconds: float, port: int) -> dict[str, Any]:
+def _listening(stream: Stream, setting: Setting, count: int, seconds: float, port: int) -> dict[str, float]:
     writer = PacketWriter()
     ready = [message for part in stream.slices for message in writer.messages(part, setting.resolution)]
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
@@ -105,10 +110,7 @@ def _listening(stream: Stream, setting: Setting, count: int, seconds: float, por
             camera.close()
         result = finish(one)
     return {
-        "cameras": count,
         "cores": cores,
-        "packets_per_s": n * count / (time.perf_counter() - started),
-        "events": result["events"],
-        "readings": result["emissions"],
+        "readings_per_packet": result["emissions"] / max(result["packets"], 1),
         "not_used": result["lost"] + result["dropped"],
     }

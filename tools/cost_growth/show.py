@@ -60,12 +60,14 @@ def draw(report: dict[str, Any], target: Path) -> None:
             points = sorted(
                 (_number(row[name]), row["ns"]["p50"] / 1e3, row["predicted_ns"] / 1e3) for row in rows
             )
+            if not points:
+                continue
             x, measured, predicted = zip(*points, strict=True)
             axes.plot(x, measured, "o", markersize=4, color=colour, label=f"{emit}, measured")
             axes.plot(x, predicted, "-", linewidth=1, color=colour, label=f"{emit}, predicted")
-        axes.set_xscale("log")
-        axes.set_xticks(x, [f"{value:,.0f}" for value in x], fontsize=6)
-        axes.set_xticks([], minor=True)
+            axes.set_xscale("log")
+            axes.set_xticks(x, [f"{value:,.0f}" for value in x], fontsize=6)
+            axes.set_xticks([], minor=True)
         axes.set_yscale("log")
         axes.set_xlabel(label)
         axes.grid(alpha=0.3)
