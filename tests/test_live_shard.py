@@ -3,7 +3,8 @@
 import json
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 
 import pytest
 import zenoh
@@ -11,8 +12,12 @@ from live_net import Collector, ListSink, attachment, compiled, free_port, plain
 from test_live_listen import CLASSIFIER, MODEL, batches, listener, message
 
 from streamfeat.errors import InputError
+from streamfeat.live.listen import Listen
+from streamfeat.live.names import RosNames
+from streamfeat.live.network import open_session
+from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
-from streamfeat.messages import LabelMessage
+from streamfeat.messages import EventPacket, LabelMessage
 from streamfeat.safe_arrays import read_safetensors
 
 # --- which share
@@ -102,6 +107,10 @@ class Cameras:
         self._put(f"cam/{name}/events", message(events, i), attachment=attachment(i + 1, gid))
         self.sent[name] += 1
 
+    def put_unannounced(self):
+        """A packet of a camera without a token."""
+        self._put("cam/unannounced/events", message(batches(1)[0]), attachment=attachment(1, b"u" * 16))
+
     def label(self, name):
         """A label for what comes next."""
         label = LabelMessage(10_000_000 * (self.sent[name] + 1), "", 10**9, "cat", "", "")
@@ -174,6 +183,64 @@ def test_every_camera_is_served_exactly_once(files):
         numbers = [number for number, _ in served[name]]
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
         assert len({publisher for _, publisher in served[name]}) == 1
+
+
+def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
+    """Each process asks for its own cameras alone; one that comes back later is heard again."""
+    port, names = free_port(), "abcdef"
+    shards = [Shard(i, 2) for i in range(2)]
+    jobs = [
+        listener(files, emit="10ms", port=port, classifier=False, shard=shard, announced=True)
+        for shard in shards
+    ]
+    with plain_session(port, listen=True) as net, ExitStack() as stack:
+        for job in jobs:
+            stack.enter_context(running(job))
+        cameras = Cameras(net, names)
+        for _ in range(2):
+            with ExitStack() as tokens:
+                for name in names:
+                    token = f"cam/{name}/events/@events/{name.encode().hex()}"
+                    tokens.enter_context(net.liveliness().declare_token(token))
+                # What somebody makes up is nobody's camera.
+                for token in ("cam/*/events/@events/00", "cam/z$*/events/@events/00"):
+                    with suppress(zenoh.ZError):
+                        tokens.enter_context(net.liveliness().declare_token(token))
+                for _ in range(20):
+                    cameras.put_unannounced()
+                cameras.until_served(names)
+            until(lambda: not any(job._cameras.topics for job in jobs), "the cameras' end")
+    for job, shard in zip(jobs, shards, strict=True):
+        mine = {f"cam/{name}/events" for name in own(shard, names)}
+        assert set(job._intake.topics) == mine
+        result = job.result()
+        assert result["cameras"] == 2 * len(mine)
+        assert "other_shards_packets" not in result
+
+
+def test_a_ros_camera_that_announces_itself_is_heard(files):
+    port, sink, asked = free_port(), ListSink(), RosNames("/cam/*/events")
+    job = Listen(asked, files / "model", emit="10ms", port=port, announced=True, silence_s=1e9)
+    names = RosNames("/cam/a/events")
+    with open_session(port=port) as net, running(job, more=sink):
+        others = RosNames("/other/events")
+        cameras = [
+            MessagePublisher(net, one, one.expression, EventPacket.SCHEMA_NAME, block=True)
+            for one in (names, others)
+        ]
+        sent = count(1)
+
+        def heard():
+            i = next(sent)
+            data = message(batches(1, events=20, start_us=10_000 * i)[0], i)
+            for camera in cameras:
+                camera.put(data)
+            return len(sink.emissions) > 2
+
+        until(heard, lambda: f"readings: {job.result()}")
+        for camera in cameras:
+            camera.close()
+    assert set(job._intake.topics) == {"/cam/a/events"}
 
 
 LISTENER = """

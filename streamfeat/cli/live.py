@@ -101,6 +101,12 @@ def listen(
         str | None,
         typer.Option(metavar="I/N", help="Serve one of N fixed shares of the cameras, I from 0 to N - 1."),
     ] = None,
+    announced: Annotated[
+        bool,
+        typer.Option(
+            "--announced", help="Hear only cameras with a liveliness token, and no others' packets."
+        ),
+    ] = False,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
     overwrite: OverwriteOption = False,
@@ -129,6 +135,7 @@ def listen(
         max_delay_s=max_delay,
         state=state,
         shard=Shard.parse(shard) if shard is not None else None,
+        announced=announced,
         console=err,
     )
     to_terminal = str(json_lines) == "-"

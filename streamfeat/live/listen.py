@@ -68,6 +68,7 @@ class Listen:
         state: file to keep what is needed to go on after a crash; gone on from, if it exists.
         state_every_s: how often it is written.
         shard: the share of the cameras to serve; all without it.
+        announced: serve those only that announce themselves; what others publish is not asked for.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
@@ -93,6 +94,7 @@ class Listen:
         state: Path | None = None,
         state_every_s: float = 1.0,
         shard: Shard | None = None,
+        announced: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
@@ -107,7 +109,7 @@ class Listen:
         if state and learn_online:
             raise InputError("--state does not keep what --learn-online learns; give one of the two")
         self._address = parse_address(metrics) if metrics else None
-        self._names, self._shard = names, shard
+        self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._reliable = learn_online, reliable
         self._engine_of = engine_of
         self._zenoh_config, self._port = zenoh_config, port
@@ -183,7 +185,12 @@ class Listen:
                 if self._address:
                     self.health.serve(*self._address)
                 with Subscription(
-                    session, self._names, self._inbox, reliable=self._reliable, shard=self._shard
+                    session,
+                    self._names,
+                    self._inbox,
+                    reliable=self._reliable,
+                    shard=self._shard,
+                    announced=self._announced,
                 ):
                     self.interrupted = run_until_interrupted([pipeline], self.stop)
             finally:

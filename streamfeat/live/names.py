@@ -106,6 +106,10 @@ class Names(Protocol):
     """How topics are called on the network."""
 
     @property
+    def expression(self) -> str:
+        """Which topics; may hold wildcards."""
+
+    @property
     def subscriptions(self) -> list[str]:
         """Key expressions of the events, and of labels for them."""
 
@@ -124,6 +128,9 @@ class Names(Protocol):
 
     def key(self, topic: str, schema: str) -> str:
         """The key to publish on."""
+
+    def only(self, topic: str) -> "Names":
+        """The names of one topic alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +169,10 @@ class PlainNames:
     def key(self, topic: str, schema: str) -> str:
         """See `Names`."""
         return topic
+
+    def only(self, topic: str) -> "PlainNames":
+        """See `Names`."""
+        return PlainNames(topic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +226,10 @@ class RosNames:
     def key(self, topic: str, schema: str) -> str:
         """See `Names`."""
         return f"{self._base(topic, schema)}/{TYPE_HASHES[schema]}"
+
+    def only(self, topic: str) -> "RosNames":
+        """See `Names`."""
+        return RosNames(topic, self.domain)
 
     def _base(self, topic: str, schema: str) -> str:
         return f"{self.domain}{topic}/{ros_type(schema)}"
