@@ -100,10 +100,11 @@ def test_a_plan_adds_up(material):
     event_ns = constants.predict(work_of(setting, Stream(material, setting, 20_000)))
     load = event_ns * 1e-9 * 100_000 + 100 * 500e-6
     assert found["cores_per_camera"] == pytest.approx(load, abs=1e-4)
-    each = found["cameras_per_process"]
-    assert each * load <= 0.5 < (each + 1) * load
-    assert found["processes"] == -(-100 // each)
-    assert found["machines"] == -(-found["processes"] // 8)
+    assert (found["machines"] - 1) * 8 * 0.5 < 100 * load <= found["machines"] * 8 * 0.5
+    assert found["processes"] == found["machines"] * 8
+    heaviest = found["cameras_of_the_heaviest_process"]
+    assert 100 / found["processes"] < heaviest < 100
+    assert found["its_cores"] == pytest.approx(heaviest * load, abs=1e-3)
     with pytest.raises(InputError, match=r"one camera keeps \d+\.\d+ cores busy"):
         plan(constants, 500.0, material, replace(setting, filters=40_000, stride=1), cameras=1, cores=8)
 
