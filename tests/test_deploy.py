@@ -39,7 +39,7 @@ def unit_words(index, environment):
 
 
 def test_the_unit_starts_a_share_of_its_own():
-    lines = re.findall(r"^#   ([A-Z]+)=(.*?)(?:  .*)?$", UNIT.read_text(), re.MULTILINE)
+    lines = re.findall(r"^#   ([A-Z]+)=(.*)$", UNIT.read_text(), re.MULTILINE)
     environment = dict(lines) | {"STATE_DIRECTORY": "/var/lib/streamfeat/2"}
     assert set(environment) == {"SHARDS", "CAMERAS", "MODEL", "OPTIONS", "STATE_DIRECTORY"}
     program, *words = unit_words(2, environment)
