@@ -70,7 +70,7 @@ ROOMS = {
     ],
     "latency": [{"histogram", "stopwatch"}, {"hop", "update"}, {"measure"}, {"words"}, {"picture"}],
     "live": [
-        {"clock", "delivery", "inbox", "names"},
+        {"clock", "delivery", "inbox", "names", "shard"},
         {"topic"},
         {"intake"},
         {"health", "network", "publisher"},

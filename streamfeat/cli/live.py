@@ -106,6 +106,16 @@ def listen(
     metrics: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve Prometheus metrics there.")
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="Serve one of N fixed shares of the cameras, I from 0 to N - 1."),
+    ] = None,
+    announced: Annotated[
+        bool,
+        typer.Option(
+            "--announced", help="Hear only cameras with a liveliness token, and no others' packets."
+        ),
+    ] = False,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
     zenoh_config: ConfigOption = None,
@@ -117,6 +127,7 @@ def listen(
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
     from streamfeat.live.listen import Listen
+    from streamfeat.live.shard import Shard
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -132,14 +143,17 @@ def listen(
         "state": state,
     }
     if cluster is not None or workers is not None:
-        if output or json_lines or table or metrics:
+        if output or json_lines or table or metrics or shard or announced:
             raise InputError(
-                "on a cluster features and predictions go to the network: leave out --output, --json-lines, "
-                "--table and --metrics, or record them with `streamfeat record`"
+                "on a cluster cameras need no --shard and no --announced, and features and predictions go to "
+                "the network: leave out --output, --json-lines, --table and --metrics, or use `record`"
             )
         _spread(names, model, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
-    job = Listen(names, model, classifier, metrics=metrics, console=err, **common)
+    share = Shard.parse(shard) if shard is not None else None
+    job = Listen(
+        names, model, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
+    )
     to_terminal = str(json_lines) == "-"
     job.run(
         console=None if quiet or as_json or to_terminal else out,

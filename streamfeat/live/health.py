@@ -185,7 +185,13 @@ class Health:
             ("reordered_packets", delivery.reordered, "Packets that arrived late"),
             ("foreign_packets", delivery.foreign, "Packets of a second publisher on the same key"),
             ("publisher_restarts", delivery.restarts, "Publishers that took over or counted anew"),
+            *self._left(),
         ]
+
+    def _left(self) -> list[tuple[str, int, str]]:
+        """Who hears no camera sees here whether there are any; without `--shard` there is nothing to see."""
+        left = self._inbox.left
+        return [("other_shards_packets", left, "Packets of cameras of other shards")] if left else []
 
     def depths(self) -> list[tuple[str, int]]:
         """What waits in each queue."""
@@ -261,6 +267,7 @@ class Health:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         result |= self.drops() | {"warnings": dict(sorted(self.reasons().items()))}
+        result |= {name: left for name, left, _ in self._left()}
         for name, seconds in self._latest_end_to_end.percentiles():
             result[f"end_to_end_{name}_ms"] = round(1e3 * seconds, 3)
         return result

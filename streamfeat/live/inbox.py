@@ -60,6 +60,10 @@ class Inbox:
     Args:
         max_bytes: of payloads, with 512 more for each message.
         max_delay_s: how long a message may wait.
+
+    Attributes:
+        dropped: messages dropped so far.
+        left: messages left to other processes.
     """
 
     def __init__(self, max_bytes: int = _MAX_BYTES, max_delay_s: float = math.inf) -> None:
@@ -71,7 +75,7 @@ class Inbox:
         self._dropped: Counter[str] = Counter()
         self._changed = threading.Condition()
         self._closed = False
-        self.dropped = 0
+        self.dropped = self.left = 0
 
     @property
     def depth(self) -> int:
@@ -88,6 +92,11 @@ class Inbox:
                 self._bytes += len(item.payload) + _OVERHEAD
                 self._drop_oldest(item.arrived_ns - self._max_delay_ns)
             self._changed.notify()
+
+    def leave(self) -> None:
+        """Count a message that is another process's to take."""
+        with self._changed:
+            self.left += 1
 
     def _drop_oldest(self, limit_ns: float) -> None:
         kept = []

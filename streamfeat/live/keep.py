@@ -31,6 +31,7 @@ from streamfeat.json_fields import Fields
 from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.live.health import Health
 from streamfeat.live.intake import Intake
+from streamfeat.live.shard import Shard
 from streamfeat.live.topic import MAX_TOPICS, Mark, resolution_in
 from streamfeat.moment import Moment, SessionSnapshot, SessionStats
 from streamfeat.safe_arrays import read_safetensors, write_safetensors
@@ -175,7 +176,9 @@ def _to_json(session: SessionSnapshot) -> dict[str, Any]:
     }
 
 
-def read_state(path: Path, fingerprint: str, intake: Intake, cameras: Cameras) -> None:
+def read_state(
+    path: Path, fingerprint: str, intake: Intake, cameras: Cameras, shard: Shard | None = None
+) -> None:
     """Let an intake and cameras go on from a file, before anything is taken.
 
     Args:
@@ -183,6 +186,7 @@ def read_state(path: Path, fingerprint: str, intake: Intake, cameras: Cameras) -
         fingerprint: of the encoder.
         intake: without a topic yet.
         cameras: without a session yet.
+        shard: what else was kept is another process's by now, and left out.
 
     Raises:
         InputError: it is not such a file, of another version or another encoder, or holds what no job was in.
@@ -194,9 +198,11 @@ def read_state(path: Path, fingerprint: str, intake: Intake, cameras: Cameras) -
     passed_ns = max(time.time_ns() - values.whole("saved_ns"), 0)
     try:
         for topic in values.inners("topics", MAX_TOPICS):
-            intake.restore(topic.text("topic"), topic, passed_ns)
+            if shard is None or shard.has(topic.text("topic")):
+                intake.restore(topic.text("topic"), topic, passed_ns)
         for i, camera in enumerate(values.inners("cameras", MAX_CAMERAS)):
-            cameras.restore(camera.text("topic"), _session(camera, arrays, i, fingerprint))
+            if shard is None or shard.has(camera.text("topic")):
+                cameras.restore(camera.text("topic"), _session(camera, arrays, i, fingerprint))
     except InputError as error:
         text = str(error).removeprefix(f"{path}: ")
         raise InputError(f"{path}: not a usable state: {text}; delete it to start anew") from None

@@ -31,6 +31,7 @@ from streamfeat.live.names import Names, beside
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.publisher import OutputSink
 from streamfeat.live.screen import HealthTable
+from streamfeat.live.shard import Shard
 from streamfeat.live.topic import Mark
 from streamfeat.packets import Packet
 from streamfeat.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
@@ -66,6 +67,8 @@ class Listen:
         max_delay_s: how long packets may wait before the oldest are dropped.
         state: file to keep what is needed to go on after a crash; gone on from, if it exists.
         state_every_s: how often it is written.
+        shard: the share of the cameras to serve; all without it.
+        announced: serve those only that announce themselves; what others publish is not asked for.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
@@ -90,6 +93,8 @@ class Listen:
         max_delay_s: float = MAX_DELAY_S,
         state: Path | None = None,
         state_every_s: float = 1.0,
+        shard: Shard | None = None,
+        announced: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
@@ -104,7 +109,7 @@ class Listen:
         if state and learn_online:
             raise InputError("--state does not keep what --learn-online learns; give one of the two")
         self._address = parse_address(metrics) if metrics else None
-        self._names = names
+        self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._reliable = learn_online, reliable
         self._engine_of = engine_of
         self._zenoh_config, self._port = zenoh_config, port
@@ -119,7 +124,7 @@ class Listen:
         self.health = Health(self._cameras, self._intake, self._inbox, self._warnings)
         self._state = state
         if state and state.exists():
-            read_state(state, self._encoder.fingerprint, self._intake, self._cameras)
+            read_state(state, self._encoder.fingerprint, self._intake, self._cameras, shard)
 
     def run(
         self,
@@ -179,7 +184,14 @@ class Listen:
             try:
                 if self._address:
                     self.health.serve(*self._address)
-                with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+                with Subscription(
+                    session,
+                    self._names,
+                    self._inbox,
+                    reliable=self._reliable,
+                    shard=self._shard,
+                    announced=self._announced,
+                ):
                     self.interrupted = run_until_interrupted([pipeline], self.stop)
             finally:
                 self.health.stop_serving()

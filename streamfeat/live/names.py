@@ -109,9 +109,6 @@ class Names(Protocol):
     def expression(self) -> str:
         """What the topics are called, perhaps with wildcards."""
 
-    def one(self, topic: str) -> "Names":
-        """The same for one topic."""
-
     @property
     def subscriptions(self) -> list[str]:
         """Key expressions of the events, and of labels for them."""
@@ -132,6 +129,9 @@ class Names(Protocol):
     def key(self, topic: str, schema: str) -> str:
         """The key to publish on."""
 
+    def only(self, topic: str) -> "Names":
+        """The names of one topic alone."""
+
 
 @dataclass(frozen=True, slots=True)
 class PlainNames:
@@ -149,10 +149,6 @@ class PlainNames:
     def tokens(self) -> str:
         """See `Names`."""
         return f"{self.expression}/{_TOKEN}/*"
-
-    def one(self, topic: str) -> "PlainNames":
-        """See `Names`."""
-        return PlainNames(topic)
 
     def schema(self, key: str, encoding: str) -> str | None:
         """See `Names`."""
@@ -173,6 +169,10 @@ class PlainNames:
     def key(self, topic: str, schema: str) -> str:
         """See `Names`."""
         return topic
+
+    def only(self, topic: str) -> "PlainNames":
+        """See `Names`."""
+        return PlainNames(topic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,10 +208,6 @@ class RosNames:
         # A topic is one chunk of a token, so wildcards within it cannot be told to zenoh.
         return f"{_ROS_TOKEN}/{self.domain}/*/*/*/MP/*/*/*/*/*/*/*"
 
-    def one(self, topic: str) -> "RosNames":
-        """See `Names`."""
-        return RosNames(topic, self.domain)
-
     def schema(self, key: str, encoding: str) -> str | None:
         """See `Names`."""
         return schema_of_ros(key.rpartition("/")[0].rpartition("/")[2])
@@ -230,6 +226,10 @@ class RosNames:
     def key(self, topic: str, schema: str) -> str:
         """See `Names`."""
         return f"{self._base(topic, schema)}/{TYPE_HASHES[schema]}"
+
+    def only(self, topic: str) -> "RosNames":
+        """See `Names`."""
+        return RosNames(topic, self.domain)
 
     def _base(self, topic: str, schema: str) -> str:
         return f"{self.domain}{topic}/{ros_type(schema)}"

@@ -9,13 +9,16 @@ the others through it. A ROS 2 router (`rmw_zenohd`) on this machine is found in
 """
 
 import json
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import zenoh
 import zenoh.ext
@@ -25,6 +28,8 @@ from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
+from streamfeat.live.shard import Shard
+from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.packets import EVENT_SCHEMAS
 
 __all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "TopicWatch", "find_topics", "open_session"]
@@ -115,9 +120,22 @@ class Subscription:
         inbox: filled.
         reliable: use zenoh's advanced subscriber, which recovers what was missed and asks for history; works
             with publishers that do the same.
+        shard: the cameras to hear; all others are left out, and their packets counted, before their bytes
+            are copied.
+        announced: hear those only that announce themselves by a token, each by a subscription of its own, so
+            that packets of other shards do not come over the network at all. A wildcard hears everybody.
     """
 
-    def __init__(self, session: zenoh.Session, names: Names, inbox: Inbox, *, reliable: bool = False) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        names: Names,
+        inbox: Inbox,
+        *,
+        reliable: bool = False,
+        shard: Shard | None = None,
+        announced: bool = False,
+    ) -> None:
         """Subscribe.
 
         Raises:
@@ -125,17 +143,25 @@ class Subscription:
         """
         self._names = names
         self._inbox = inbox
+        self._shard = shard
+        self._session, self._reliable = session, reliable
+        # zenoh may not be asked for a subscription from within its own callbacks.
+        self._come: SimpleQueue[str | None] = SimpleQueue()
+        self._follower = threading.Thread(target=self._follow, name="streamfeat follower", daemon=True)
         self._tokens: dict[str, set[str]] = {}
         self._open: list[object] = []
         try:
+            wanted = [] if announced else names.subscriptions
+            self._wanted = zenoh.KeyExpr(names.expression.strip("/"))
+            if announced:
+                self._follower.start()
             # First the tokens: who leaves was there before.
             self._open.append(
                 session.liveliness().declare_subscriber(
                     names.tokens, Callback(self._on_token, indirect=False), history=True
                 )
             )
-            for expression in names.subscriptions:
-                self._open.append(self._subscribe(session, expression, reliable))
+            self._open += [self._subscribe(expression) for expression in wanted]
             if isinstance(names, RosNames):
                 self._announce(session, names)
         except zenoh.ZError as error:
@@ -159,13 +185,33 @@ class Subscription:
         for declared in reversed(self._open):
             declared.undeclare()  # type: ignore[attr-defined]
         self._open.clear()
+        if self._follower.is_alive():
+            self._come.put(None)
+            self._follower.join()
 
-    def _subscribe(self, session: zenoh.Session, expression: str, reliable: bool) -> object:
+    def _follow(self) -> None:
+        """Subscribe to each topic that is announced; who left may have packets under way."""
+        followed: dict[str, list[Any]] = {}
+        while (topic := self._come.get()) is not None:
+            if topic in followed:
+                continue
+            with suppress(zenoh.ZError, InputError):  # no topic: somebody made that token up
+                names = self._names.only(topic).subscriptions
+                followed[topic] = [self._subscribe(expression) for expression in names]
+            gone = [one for one in followed if one not in self._tokens]
+            for one in gone[: max(len(followed) - MAX_TOPICS, 0)]:
+                for declared in followed.pop(one):
+                    declared.undeclare()
+        for several in followed.values():
+            for declared in several:
+                declared.undeclare()
+
+    def _subscribe(self, expression: str) -> object:
         callback = Callback(self._on_sample, indirect=False)
-        if not reliable:
-            return session.declare_subscriber(expression, callback)
+        if not self._reliable:
+            return self._session.declare_subscriber(expression, callback)
         return zenoh.ext.declare_advanced_subscriber(
-            session,
+            self._session,
             expression,
             callback,
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_HISTORY),
@@ -186,6 +232,9 @@ class Subscription:
         topic = self._names.topic(key)
         if sample.kind != zenoh.SampleKind.PUT or topic.rpartition("/")[2] in OUTPUTS:
             return
+        if self._shard and not self._shard.has(topic):
+            self._inbox.leave()
+            return
         size = len(sample.payload)
         problem = "too large" if size > MAX_PAYLOAD_BYTES else ""
         attachment = sample.attachment
@@ -204,7 +253,7 @@ class Subscription:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         topic = self._names.token_topic(str(sample.key_expr))
-        if not topic:
+        if not topic or (self._shard and not self._shard.has(topic)):
             return
         # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
         tokens = self._tokens.setdefault(topic, set())
@@ -212,6 +261,8 @@ class Subscription:
             tokens.add(str(sample.key_expr))
             if len(tokens) == 1:
                 self._inbox.put(Announcement(topic, here=True))
+                if self._follower.is_alive() and _is_of(self._wanted, topic):
+                    self._come.put(topic)
             return
         tokens.discard(str(sample.key_expr))
         if not tokens:
@@ -235,12 +286,11 @@ class TopicWatch:
             InputError: zenoh refuses the key expression.
         """
         try:
-            wanted = zenoh.KeyExpr(names.expression.lstrip("/"))
+            wanted = zenoh.KeyExpr(names.expression.strip("/"))
 
             def on_token(sample: zenoh.Sample) -> None:
                 topic = names.token_topic(str(sample.key_expr))
-                is_there = topic and sample.kind == zenoh.SampleKind.PUT
-                if is_there and wanted.intersects(zenoh.KeyExpr(topic.lstrip("/"))):
+                if topic and sample.kind == zenoh.SampleKind.PUT and _is_of(wanted, topic):
                     on_topic(topic)
 
             self._watching = session.liveliness().declare_subscriber(
@@ -258,6 +308,14 @@ class TopicWatch:
     ) -> None:
         """Stop watching."""
         self._watching.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _is_of(wanted: zenoh.KeyExpr, topic: str) -> bool:
+    """Whether a token is of a topic that is wanted: ROS 2 tells of all, and nobody's token is a wildcard."""
+    try:
+        return "*" not in topic and wanted.includes(zenoh.KeyExpr(topic.strip("/")))
+    except zenoh.ZError:
+        return False
 
 
 @dataclass(frozen=True, slots=True, order=True)

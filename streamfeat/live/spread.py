@@ -19,6 +19,7 @@ from streamfeat.cluster import Cluster, Errand
 from streamfeat.live.listen import Listen
 from streamfeat.live.names import Names
 from streamfeat.live.network import TopicWatch, open_session
+from streamfeat.live.topic import MAX_TOPICS
 
 __all__ = ["Served", "Spread"]
 
@@ -130,10 +131,14 @@ class Spread:
 
         def serve(topic: str) -> None:
             with self._lock:
-                is_new = topic not in self.cameras
-                self.cameras.setdefault(topic, Served())
-            if is_new:
-                errands.begin(topic, _serve, self._names.one(topic), self._files, self._options, self._state)
+                if topic in self.cameras:
+                    return
+                if len(self.cameras) < MAX_TOPICS:
+                    self.cameras[topic] = Served()
+            if topic not in self.cameras:
+                self._say(f"{topic}: not served, {MAX_TOPICS} cameras are")
+            else:
+                errands.begin(topic, _serve, self._names.only(topic), self._files, self._options, self._state)
 
         with contextlib.ExitStack() as stack:
             stack.callback(errands.end)

@@ -18,10 +18,12 @@ sys.path.append(str(ROOT))
 from tools.live_bench import faults  # noqa: E402
 from tools.live_bench.latency import measure_latency  # noqa: E402
 from tools.live_bench.rates import measure_rate  # noqa: E402
+from tools.live_bench.shards import measure_shards  # noqa: E402
 
 MEASUREMENTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "latency": measure_latency,
     "rate": measure_rate,
+    "shards": measure_shards,
     "publisher": faults.publisher_killed,
     "router": faults.router_killed,
     "stopped": faults.subscriber_stopped,

@@ -5,6 +5,7 @@ Lives here: what starts, watches and ends the commands under test.
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -126,6 +127,12 @@ def counts(metrics: int) -> dict[str, float]:
         lines = page.read().decode().splitlines()
     pairs = (line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     return {name.removeprefix("streamfeat_").removesuffix("_total"): float(value) for name, value in pairs}
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time that a process has taken so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def finish(one: Process) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import json
 import time
 from argparse import Namespace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ from tools.live_bench.processes import (
     wait_for_reader,
 )
 
+PACKET = 4096
+"""Events of a packet."""
+
 
 def measure_rate(arguments: Namespace) -> dict[str, Any]:
     """The highest rate at which nothing is lost for as long as asked, and ten times that for ten seconds."""
@@ -44,10 +48,7 @@ def measure_rate(arguments: Namespace) -> dict[str, Any]:
 
 def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "auto") -> dict[str, Any]:
     """Publish packets of 4,096 events at a rate; nothing waits for the listener."""
-    rng = np.random.default_rng(0)
-    size, ready = 4096, []
-    writer = PacketWriter()
-    events = np.concatenate(camera_packets(arguments.recording, 5))
+    size = PACKET
     step_us = max(int(size / rate * 1e6), 1)
     with (
         open_session(port=arguments.port) as session,
@@ -56,12 +57,7 @@ def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "aut
         reader = Reader(session)
         camera = MessagePublisher(session, PlainNames(KEY), KEY, EventPacket.SCHEMA_NAME)
         wait_for_reader(session, KEY)
-        # The same pixels again and again, at the times of this rate; encoding is not what is measured.
-        for i in range(min(len(events) // size, 64)):
-            batch = events[i * size : (i + 1) * size].copy()
-            batch["t"] = np.sort(rng.integers(0, step_us, len(batch)))
-            (message,) = writer.messages(batch, FRAME)
-            ready.append(message)
+        ready = ready_packets(arguments.recording, step_us)
         started, n = time.perf_counter(), 0
         while (now := time.perf_counter()) - started < seconds:
             due = int((now - started) * rate / size)
@@ -106,6 +102,17 @@ def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "aut
         "end_to_end_p99_ms": result.get("end_to_end_p99_ms"),
         "cameras_seen": int(seen["cameras"]),
     }
+
+
+def ready_packets(recording: Path, step_us: int) -> list[EventPacket]:
+    """Packets, at most 64, encoded: the same pixels again and again, at the times of a rate."""
+    rng, writer, ready = np.random.default_rng(0), PacketWriter(), []
+    events = np.concatenate(camera_packets(recording, 5))
+    for i in range(min(len(events) // PACKET, 64)):
+        batch = events[i * PACKET : (i + 1) * PACKET].copy()
+        batch["t"] = np.sort(rng.integers(0, step_us, len(batch)))
+        ready += writer.messages(batch, FRAME)
+    return ready
 
 
 def _is_whole(tried: dict[str, Any]) -> bool:

@@ -1,0 +1,1 @@
+"""How the cost of events grows, measured and predicted; run it with `python tools/cost_growth`."""
