@@ -1,0 +1,165 @@
+"""Compare Ray and Dask on the jobs that streamfeat has for a cluster, in turns, each run from nothing.
+
+python tools/compare_clusters cost worker
+python tools/compare_clusters all -r ncars.mcap -m model.safetensors --samples 1600 --rounds 3 --json out.json
+
+`cost` starts a cluster of one and of two workers, has it run empty tasks, and does both jobs, which are done
+in a process without an engine as well; `worker` and `node` kill while the jobs run; `serve`, `serve_node`,
+`cut` and `cut_quick` kill or cut off who serves four keys (the last with short timeouts), `actor` kills an
+actor of Dask. Those with nodes need the right to make network namespaces. Each thread of BLAS is alone.
+"""
+
+import argparse
+import json
+import os
+import secrets
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT))
+
+from streamfeat.machine import Disturbance, describe_machine  # noqa: E402
+from tools.compare_clusters import live, nodes, offline, work  # noqa: E402
+from tools.compare_clusters.engines import QUICK  # noqa: E402
+
+MEASUREMENTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
+    "cost": offline.cost,
+    "worker": offline.worker_killed,
+    "node": offline.node_killed,
+    "serve": live.process_killed,
+    "serve_node": live.node_killed,
+    "cut": live.node_cut_off,
+    "cut_quick": live.node_cut_off,
+    "actor": live.dask_actor_killed,
+}
+MODULES = {"ray": "ray", "dask": "distributed"}
+_LIMIT_S = 600
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("what", nargs="+", choices=[*MEASUREMENTS, "all"])
+    add("-r", "--recording", type=Path, default=ROOT / "recordings" / "digits_train.mcap")
+    add("-m", "--model", type=Path, default=ROOT / "recordings" / "digits.safetensors")
+    add("--engines", nargs="+", choices=list(MODULES), default=list(MODULES))
+    add("--samples", type=int, default=800, help="labelled samples (default: %(default)s)")
+    add("--each", type=int, default=100, help="of them in a task (default: %(default)s)")
+    add("--rounds", type=int, default=1, help="of all engines in turn (default: %(default)s)")
+    add("--json", type=Path, help="write every run there")
+    add("--child", nargs=3, metavar=("ENGINE", "WORKERS", "FOLDER"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        _child(arguments)
+        return
+    engines = [name for name in arguments.engines if find_spec(MODULES[name])]
+    if not engines:
+        parser.error("none of the engines is installed: pip install ray distributed")
+    with tempfile.TemporaryDirectory(prefix="clusters") as name:
+        folder = Path(name)
+        work.split_recording(
+            arguments.recording, arguments.model, folder, arguments.samples, arguments.each
+        )
+        runs = _all_runs(arguments, engines, folder)
+    report = {"machine": describe_machine(), "load": os.getloadavg()[0], "runs": runs}
+    if arguments.json:
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
+    print(json.dumps(report["machine"]))
+    _show(runs)
+
+
+def _all_runs(arguments: argparse.Namespace, engines: list[str], folder: Path) -> list[dict[str, Any]]:
+    runs = []
+    for what in MEASUREMENTS if "all" in arguments.what else arguments.what:
+        for number in range(arguments.rounds):
+            cases = [(engine, 2) for engine in engines]
+            if what == "cost":
+                cases = [("none", 1), *((engine, n) for n in (1, 2) for engine in engines)]
+            for engine, workers in cases:
+                steal = Disturbance()
+                found = _in_child(what, engine, workers, folder, arguments)
+                run = {"what": what, "engine": engine, "workers": workers, "round": number} | found
+                runs.append(run | {"steal": round(steal.steal_share() or 0.0, 3)})
+                print(json.dumps(runs[-1]), file=sys.stderr, flush=True)
+    return runs
+
+
+def _in_child(
+    what: str, engine: str, workers: int, parts: Path, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    """One measurement in a process of its own, all of whose descendants end with it."""
+    folder = parts / f"{what}-{engine}-{workers}"
+    folder.mkdir()
+    for path in (*parts.glob("*.mcap"), *parts.glob("*.npy")):
+        (folder / path.name).hardlink_to(path)
+    one = "OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS NUMBA_NUM_THREADS".split()
+    environment = os.environ | dict.fromkeys(one, "1")
+    # Its own token, or Ray writes one into the home folder; and no reports to its makers.
+    environment |= {"RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+    environment |= {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment |= QUICK if what == "cut_quick" else {}
+    command = [sys.executable, "-m", "tools.compare_clusters", what, "-m", str(arguments.model.resolve())]
+    command += ["--child", engine, str(workers), str(folder)]
+    child = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        text, errors = child.communicate(timeout=_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return {"failed": f"not done after {_LIMIT_S} s"}
+    finally:
+        if child.poll() is None:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.communicate()
+        shutil.rmtree(folder, ignore_errors=True)
+    if child.returncode or not text.strip():
+        return {"failed": (errors.strip() or "no output").splitlines()[-1]}
+    return json.loads(text.splitlines()[-1])
+
+
+def _child(arguments: argparse.Namespace) -> None:
+    engine, workers, folder = arguments.child
+    arguments.workers, arguments.folder = int(workers), folder
+    try:
+        found = MEASUREMENTS[arguments.what[0]](engine, arguments)
+    except nodes.Skipped as why:
+        found = {"skipped": str(why)}
+    print(json.dumps(found), flush=True)
+
+
+def _show(runs: list[dict[str, Any]]) -> None:
+    """A table of medians: a line for each figure, a column for each engine."""
+    cases = dict.fromkeys((run["what"], run["workers"]) for run in runs if run["engine"] != "none")
+    columns = [name for name in ("none", *MODULES) if any(run["engine"] == name for run in runs)]
+    print(f"{'':<28}" + "".join(f"{name:>24}" for name in columns))
+    for what, workers in cases:
+        mine = [run for run in runs if run["what"] == what and run["workers"] in (workers, 1)]
+        mine = [run for run in mine if run["engine"] == "none" or run["workers"] == workers]
+        known = {"what", "engine", "workers", "round"}
+        for figure in dict.fromkeys(key for run in mine for key in run if key not in known):
+            cells = [_middle([r[figure] for r in mine if r["engine"] == e and figure in r]) for e in columns]
+            print(f"{what} {workers}: {figure:<20}"[:28].ljust(28) + "".join(f"{cell:>24}" for cell in cells))
+
+
+def _middle(values: list[Any]) -> str:
+    numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+    if numbers and len(numbers) == len(values):
+        spread = f" ({min(numbers):.3g}-{max(numbers):.3g})" if len(numbers) > 1 else ""
+        return f"{statistics.median(numbers):.3g}{spread}"
+    return ", ".join(dict.fromkeys(json.dumps(v) for v in values))[:60]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Two nodes of an engine, the second in a network namespace of its own.
+
+Lives here: how they are started, killed, cut off, and which ports they used between them.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+SPACE, OUTSIDE, INSIDE = "sfclust", "sfc0", "sfc1"
+HERE, THERE = "10.213.78.1", "10.213.78.2"
+PORT = 17890
+_SETUP = (
+    f"ip netns add {SPACE}",
+    f"ip link add {OUTSIDE} type veth peer name {INSIDE} netns {SPACE}",
+    f"ip addr add {HERE}/24 dev {OUTSIDE}",
+    f"ip link set {OUTSIDE} up",
+    f"ip -n {SPACE} addr add {THERE}/24 dev {INSIDE}",
+    f"ip -n {SPACE} link set {INSIDE} up",
+    f"ip -n {SPACE} link set lo up",
+)
+_RAY = ["--num-cpus=2", "--object-store-memory=200000000", "--disable-usage-stats", "--block"]
+
+
+class Skipped(Exception):
+    """This machine cannot do it, for the reason given."""
+
+
+class Two:
+    """A scheduler or head with a worker here, a worker in the namespace."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.talked: list[str] = []
+
+    def pids(self) -> list[int]:
+        """The processes in the namespace."""
+        found = subprocess.run(["ip", "netns", "pids", SPACE], capture_output=True, text=True, timeout=20)
+        return [int(pid) for pid in found.stdout.split()]
+
+    def kill(self) -> None:
+        self.talked = _connections()
+        for pid in self.pids():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def link(self, state: str) -> None:
+        self.talked = self.talked or _connections()
+        subprocess.run(["ip", "-n", SPACE, "link", "set", INSIDE, state], check=True, timeout=20)
+
+
+@contextlib.contextmanager
+def two(engine: str, folder: Path, threads: int = 1) -> Iterator[Two]:
+    """Start both and end them.
+
+    Args:
+        engine: `ray` or `dask`.
+        folder: where they may write.
+        threads: of a Dask worker: as many functions that run for ever fit in.
+
+    Raises:
+        Skipped: there can be no namespace here.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.callback(_run, f"ip netns del {SPACE}")
+        for command in _SETUP:
+            if problem := _run(command):
+                raise Skipped(f"{command}: {problem}")
+        address = f"{HERE}:{PORT}" if engine == "ray" else f"tcp://{HERE}:{PORT}"
+        inside = ["ip", "netns", "exec", SPACE]
+        both = Two(address)
+        stack.callback(_end, both)
+        for number, command in enumerate(_commands(engine, address, threads)):
+            prefix = inside if number == len(_commands(engine, address, threads)) - 1 else []
+            log = stack.enter_context((folder / f"{engine}{number}.txt").open("wb"))
+            process = subprocess.Popen(
+                [*prefix, sys.executable, "-m", *command], stdout=log, stderr=log, start_new_session=True
+            )
+            stack.callback(_terminate, process)
+            _until_listening(PORT, process)
+        yield both
+
+
+def _commands(engine: str, address: str, threads: int) -> list[list[str]]:
+    if engine == "ray":
+        ray = ["ray.scripts.scripts", "start", *_RAY]
+        return [
+            [*ray, "--head", f"--port={PORT}", f"--node-ip-address={HERE}", "--include-dashboard=false"],
+            [*ray, f"--address={address}", f"--node-ip-address={THERE}"],
+        ]
+    worker = ["distributed.cli.dask_worker", address, f"--nthreads={threads}", "--memory-limit=0"]
+    scheduler = ["distributed.cli.dask_scheduler", f"--host={HERE}", f"--port={PORT}", "--no-dashboard"]
+    return [
+        scheduler,
+        [*worker, f"--host={HERE}", "--no-dashboard"],
+        [*worker, f"--host={THERE}", "--no-dashboard"],
+    ]
+
+
+def _run(command: str) -> str:
+    done = subprocess.run(command.split(), capture_output=True, text=True, timeout=20)
+    return done.stderr.strip() or "failed" if done.returncode else ""
+
+
+def _until_listening(port: int, process: subprocess.Popen[bytes]) -> None:
+    limit = time.monotonic() + 90
+    while time.monotonic() < limit and process.poll() is None:
+        found = subprocess.run(["ss", "-ltnH", f"sport = {port}"], capture_output=True, timeout=20)
+        if found.stdout:
+            return
+        time.sleep(0.1)
+    raise Skipped(f"the first node did not come up: exit status {process.poll()}")
+
+
+def _connections() -> list[str]:
+    """Between the two nodes, who connected to which listening port."""
+    listening = {}
+    for space, prefix in ((HERE, []), (THERE, ["ip", "netns", "exec", SPACE])):
+        ss = subprocess.run([*prefix, "ss", "-ltnH"], capture_output=True, text=True, timeout=20)
+        listening[space] = {line.split()[3].rpartition(":")[2] for line in ss.stdout.splitlines()}
+    ss = subprocess.run(["ss", "-tnH"], capture_output=True, text=True, timeout=20)
+    found = set()
+    for line in ss.stdout.splitlines():
+        (one, first), (other, second) = (end.replace("[::ffff:", "").rpartition(":")[::2] for end in line.split()[3:5])
+        if {one.strip("]"), other.strip("]")} == {HERE, THERE}:
+            mine = first in listening[HERE]
+            found.add(f"{'here' if mine else 'there'}:{first if mine else second}")
+    return sorted(found)
+
+
+def _terminate(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(20)
+
+
+def _end(both: Two) -> None:
+    for pid in both.pids():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
