@@ -4,8 +4,8 @@ python tools/compare_clusters cost worker
 python tools/compare_clusters all -r ncars.mcap -m model.safetensors --samples 1600 --rounds 3 --json out.json
 
 `cost` starts a cluster of one and of two workers, has it run empty tasks, and does both jobs, which are done
-in a process without an engine as well; `worker` and `node` kill while the jobs run; `serve`, `serve_node`,
-`cut` and `cut_quick` kill or cut off who serves four keys (the last with short timeouts), `actor` kills an
+in a process without an engine as well; `worker` and `node` kill while the jobs run; `serve`, `serve_own`,
+`serve_node` and `cut` kill or cut off who serves four keys (`quick`: with short timeouts), `actor` kills an
 actor of Dask. Those with nodes need the right to make network namespaces. Each thread of BLAS is alone.
 """
 
@@ -36,7 +36,9 @@ MEASUREMENTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     "worker": offline.worker_killed,
     "node": offline.node_killed,
     "serve": live.process_killed,
+    "serve_own": live.own_process_killed,
     "serve_node": live.node_killed,
+    "serve_node_quick": live.node_killed,
     "cut": live.node_cut_off,
     "cut_quick": live.node_cut_off,
     "actor": live.dask_actor_killed,
@@ -101,14 +103,17 @@ def _in_child(
     """One measurement in a process of its own, all of whose descendants end with it."""
     folder = parts / f"{what}-{engine}-{workers}"
     folder.mkdir()
+    # Ray's folder holds sockets, whose paths may not be long.
+    short = tempfile.mkdtemp(prefix="r")
     for path in (*parts.glob("*.mcap"), *parts.glob("*.npy")):
         (folder / path.name).hardlink_to(path)
     one = "OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS NUMBA_NUM_THREADS".split()
     environment = os.environ | dict.fromkeys(one, "1")
     # Its own token, or Ray writes one into the home folder; and no reports to its makers.
-    environment |= {"RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+    environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    environment |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_TMPDIR": short}
     environment |= {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    environment |= QUICK if what == "cut_quick" else {}
+    environment |= QUICK if what.endswith("quick") else {}
     command = [sys.executable, "-m", "tools.compare_clusters", what, "-m", str(arguments.model.resolve())]
     command += ["--child", engine, str(workers), str(folder)]
     child = subprocess.Popen(
@@ -124,6 +129,7 @@ def _in_child(
             os.killpg(child.pid, signal.SIGKILL)
             child.communicate()
         shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(short, ignore_errors=True)
     if child.returncode or not text.strip():
         return {"failed": (errors.strip() or "no output").splitlines()[-1]}
     return json.loads(text.splitlines()[-1])

@@ -4,6 +4,7 @@ Lives here: how each is started, given tasks, and given functions that run for e
 """
 
 import contextlib
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -62,9 +63,11 @@ class OnRay:
         self._ray = ray
         here: dict[str, Any] = {"address": address, "_node_ip_address": (address or "").split(":")[0]}
         if address is None:
-            here = {"num_cpus": workers, "num_gpus": 0, "object_store_memory": STORE_BYTES}
+            here = {"address": "local", "num_cpus": workers, "num_gpus": 0, "object_store_memory": STORE_BYTES}
             here |= {"include_dashboard": False}
         ray.init(log_to_driver=False, logging_level="ERROR", **here)
+        if address:
+            until(lambda: sum(node["Alive"] for node in ray.nodes()) >= workers, "its nodes")
 
         class Actor:
             def run(self, task: Callable[..., Any], *values: Any) -> Any:
@@ -107,6 +110,7 @@ class OnDask:
             )
             address = self._stack.enter_context(local)
         self.client = self._stack.enter_context(Client(address, timeout=60))
+        self.client.wait_for_workers(workers, timeout=TIMEOUT_S)
 
     def submit(self, task: Callable[..., Any], *values: Any) -> Any:
         return self.client.submit(task, *values, pure=False)
@@ -120,6 +124,19 @@ class OnDask:
 
     def stop(self) -> None:
         self._stack.close()
+
+
+def until(condition: Callable[[], Any], what: str, limit_s: float = 120.0) -> None:
+    """Wait for a state.
+
+    Raises:
+        TimeoutError: it does not come.
+    """
+    limit = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > limit:
+            raise TimeoutError(f"waited {limit_s:g} s for {what}")
+        time.sleep(0.01)
 
 
 def started(name: str, workers: int, *, address: str | None = None, servers: int = 1) -> Engine:

@@ -12,20 +12,28 @@ from pathlib import Path
 from typing import Any
 
 from tools.compare_clusters import nodes, work
-from tools.compare_clusters.engines import Engine, started
+from tools.compare_clusters.engines import Engine, started, until
 
 KEYS = tuple(f"cam{i}" for i in range(4))
-_PATIENCE_S = 120.0
 
 
 def process_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
-    """SIGKILL for the process that serves the first key, on one node."""
-    one = started(engine, 2, servers=len(KEYS))
-    folder = Path(arguments.folder)
+    """SIGKILL for the process that serves the first key; each of two workers has room for all keys."""
+    return _process_killed(started(engine, 2, servers=len(KEYS)), Path(arguments.folder))
+
+
+def own_process_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
+    """The same where each key has a worker of its own, and none is to spare."""
+    return _process_killed(started(engine, len(KEYS)), Path(arguments.folder))
+
+
+def _process_killed(one: Engine, folder: Path) -> dict[str, Any]:
     try:
         handles = _serving(one, folder)
         victim = _servers(folder)[KEYS[0]]
-        return _watched(folder, {victim}, lambda: os.kill(victim, signal.SIGKILL)) | _ended(folder, one, handles)
+        return _watched(folder, {victim}, lambda: os.kill(victim, signal.SIGKILL)) | _ended(
+            folder, one, handles
+        )
     finally:
         one.stop()
 
@@ -37,8 +45,9 @@ def node_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
         one = started(engine, 2, address=two.address)
         try:
             handles = _serving(one, folder)
+            talked = nodes.connections()
             found = _watched(folder, set(two.pids()), two.kill)
-            return found | _ended(folder, one, handles) | {"talked": two.talked}
+            return found | _ended(folder, one, handles) | {"talked": talked}
         finally:
             one.stop()
 
@@ -50,12 +59,14 @@ def node_cut_off(engine: str, arguments: Namespace) -> dict[str, Any]:
         one = started(engine, 2, address=two.address)
         try:
             handles = _serving(one, folder)
+            cut = time.monotonic()
             found = _watched(folder, set(two.pids()), lambda: two.link("down"))
             time.sleep(5)
             two.link("up")
+            found["cut_s"] = round(time.monotonic() - cut, 1)
             time.sleep(20)
             found["twice_s"] = round(max(_overlap(folder, key) for key in KEYS), 2)
-            return found | _ended(folder, one, handles) | {"talked": two.talked}
+            return found | _ended(folder, one, handles)
         finally:
             one.stop()
 
@@ -69,7 +80,7 @@ def dask_actor_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
     try:
         actor = one.client.submit(_Server, folder, KEYS[0], actor=True).result(timeout=60)
         running = actor.run()
-        _until(lambda: work.beats(folder, KEYS[0]), "a beat")
+        until(lambda: work.beats(folder, KEYS[0]), "a beat")
         os.kill(next(iter(work.beats(folder, KEYS[0]))), signal.SIGKILL)
         try:
             running.result(timeout=30)
@@ -94,7 +105,7 @@ class _Server:
 def _serving(one: Engine, folder: Path) -> list[Any]:
     """Have all keys served, by two processes at least."""
     handles = [one.serve(work.serve, folder, key) for key in KEYS]
-    _until(lambda: all(work.beats(folder, key) for key in KEYS), "every key to be served")
+    until(lambda: all(work.beats(folder, key) for key in KEYS), "every key to be served")
     time.sleep(1)
     return handles
 
@@ -121,19 +132,19 @@ def _watched(folder: Path, victims: set[int], strike: Callable[[], None]) -> dic
         return min((t[0] for t in others if len(t)), default=None)
 
     try:
-        _until(lambda: all(again(key) is not None for key in hit), "every key to be served again")
+        until(lambda: all(again(key) is not None for key in hit), "every key to be served again")
     except TimeoutError as error:
         return {"hit": len(hit), "again_s": None, "why": str(error)}
     last = max((again(key) for key in hit), default=struck)
     time.sleep(2)
-    twice = max((_overlap(folder, key) for key in KEYS), default=0.0)
+    twice = max(_overlap(folder, key) for key in KEYS)
     return {"hit": len(hit), "again_s": round(last - struck, 3), "twice_s": round(twice, 2)}
 
 
 def _overlap(folder: Path, key: str) -> float:
     """Seconds in which a key was served by two processes at once."""
     spans = sorted((times[0], times[-1]) for times in work.beats(folder, key).values() if len(times))
-    return max((min(a[1], b[1]) - b[0] for a, b in zip(spans, spans[1:], strict=False)), default=0.0)
+    return max([0.0, *(min(a[1], b[1]) - b[0] for a, b in zip(spans, spans[1:], strict=False))])
 
 
 def _ended(folder: Path, one: Engine, handles: list[Any]) -> dict[str, Any]:
@@ -144,10 +155,3 @@ def _ended(folder: Path, one: Engine, handles: list[Any]) -> dict[str, Any]:
     except Exception as error:
         return {"ended": f"{type(error).__name__}: {error}".splitlines()[0][:200]}
 
-
-def _until(condition: Callable[[], Any], what: str) -> None:
-    limit = time.monotonic() + _PATIENCE_S
-    while not condition():
-        if time.monotonic() > limit:
-            raise TimeoutError(f"waited {_PATIENCE_S:g} s for {what}")
-        time.sleep(0.01)

@@ -14,7 +14,8 @@ from pathlib import Path
 
 SPACE, OUTSIDE, INSIDE = "sfclust", "sfc0", "sfc1"
 HERE, THERE = "10.213.78.1", "10.213.78.2"
-PORT = 17890
+PORT = 6399
+"""Below 10002: from there to 19999 Ray wants every port for its workers."""
 _SETUP = (
     f"ip netns add {SPACE}",
     f"ip link add {OUTSIDE} type veth peer name {INSIDE} netns {SPACE}",
@@ -36,7 +37,6 @@ class Two:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        self.talked: list[str] = []
 
     def pids(self) -> list[int]:
         """The processes in the namespace."""
@@ -44,13 +44,9 @@ class Two:
         return [int(pid) for pid in found.stdout.split()]
 
     def kill(self) -> None:
-        self.talked = _connections()
-        for pid in self.pids():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        _kill(self.pids())
 
     def link(self, state: str) -> None:
-        self.talked = self.talked or _connections()
         subprocess.run(["ip", "-n", SPACE, "link", "set", INSIDE, state], check=True, timeout=20)
 
 
@@ -74,15 +70,15 @@ def two(engine: str, folder: Path, threads: int = 1) -> Iterator[Two]:
         address = f"{HERE}:{PORT}" if engine == "ray" else f"tcp://{HERE}:{PORT}"
         inside = ["ip", "netns", "exec", SPACE]
         both = Two(address)
-        stack.callback(_end, both)
+        stack.callback(both.kill)
         for number, command in enumerate(_commands(engine, address, threads)):
             prefix = inside if number == len(_commands(engine, address, threads)) - 1 else []
             log = stack.enter_context((folder / f"{engine}{number}.txt").open("wb"))
             process = subprocess.Popen(
                 [*prefix, sys.executable, "-m", *command], stdout=log, stderr=log, start_new_session=True
             )
-            stack.callback(_terminate, process)
-            _until_listening(PORT, process)
+            stack.callback(_end, process)
+            _until_listening(PORT, Path(log.name), process)
         yield both
 
 
@@ -107,17 +103,18 @@ def _run(command: str) -> str:
     return done.stderr.strip() or "failed" if done.returncode else ""
 
 
-def _until_listening(port: int, process: subprocess.Popen[bytes]) -> None:
+def _until_listening(port: int, log: Path, process: subprocess.Popen[bytes]) -> None:
     limit = time.monotonic() + 90
     while time.monotonic() < limit and process.poll() is None:
         found = subprocess.run(["ss", "-ltnH", f"sport = {port}"], capture_output=True, timeout=20)
         if found.stdout:
             return
         time.sleep(0.1)
-    raise Skipped(f"the first node did not come up: exit status {process.poll()}")
+    said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:]
+    raise Skipped(f"the first node did not come up: exit status {process.poll()}, {said}")
 
 
-def _connections() -> list[str]:
+def connections() -> list[str]:
     """Between the two nodes, who connected to which listening port."""
     listening = {}
     for space, prefix in ((HERE, []), (THERE, ["ip", "netns", "exec", SPACE])):
@@ -133,16 +130,23 @@ def _connections() -> list[str]:
     return sorted(found)
 
 
-def _terminate(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait(20)
+def family(pid: int) -> list[int]:
+    """A process and all that come from it."""
+    found = [pid]
+    for one in found:
+        for task in Path(f"/proc/{one}/task").glob("*/children"):
+            with contextlib.suppress(OSError):
+                found += [int(child) for child in task.read_text().split()]
+    return found
 
 
-def _end(both: Two) -> None:
-    for pid in both.pids():
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill all that a node is made of: asked to end, Ray waits half a minute for what serves for ever."""
+    _kill(family(process.pid))
+    process.wait(20)
+
+
+def _kill(pids: list[int]) -> None:
+    for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)

@@ -31,7 +31,7 @@ def cost(engine: str, arguments: Namespace) -> dict[str, Any]:
         found: dict[str, Any] = {"first_result_s": time.perf_counter() - began}
         _warm(one, arguments)
         if engine != "none":
-            found |= {"idle_mb": sum(map(_pss, _family())) - before, "listens": _listening()}
+            found |= {"idle_mb": sum(map(_pss, nodes.family(os.getpid()))) - before, "listens": _listening()}
         one.results([one.submit(work.nothing, i) for i in range(50)])
         began = time.perf_counter()
         one.results([one.submit(work.nothing, i) for i in range(_EMPTY)])
@@ -57,7 +57,7 @@ def node_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
     with nodes.two(engine, Path(arguments.folder)) as two:
         one = started(engine, 2, address=two.address)
         try:
-            return _disturbed(one, arguments, lambda pid: two.kill()) | {"talked": two.talked}
+            return _disturbed(one, arguments, lambda pid: two.kill())
         finally:
             one.stop()
 
@@ -115,15 +115,6 @@ def _warm(one: Engine, arguments: Namespace) -> None:
     one.results([one.submit(work.sum_chunk, folder, 0, model, log) for _ in range(4)])
 
 
-def _family() -> list[int]:
-    """This process and all that come from it."""
-    found = [os.getpid()]
-    for pid in found:
-        for task in Path(f"/proc/{pid}/task").glob("*/children"):
-            found += [int(child) for child in task.read_text().split()]
-    return found
-
-
 def _pss(pid: int) -> float:
     """Its share of memory in MB, where what several map counts once in all."""
     try:
@@ -135,7 +126,7 @@ def _pss(pid: int) -> float:
 
 def _listening() -> dict[str, int]:
     """How many TCP sockets of these processes listen on loopback only, and how many beyond."""
-    mine = {f"pid={pid}," for pid in _family()}
+    mine = {f"pid={pid}," for pid in nodes.family(os.getpid())}
     lines = subprocess.run(["ss", "-ltnpH"], capture_output=True, text=True, timeout=20).stdout.splitlines()
     where = [line.split()[3] for line in lines if any(pid in line for pid in mine)]
     inside = sum(address.startswith(("127.", "[::1]")) for address in where)
