@@ -6,7 +6,7 @@ python tools/compare_clusters all -r ncars.mcap -m model.safetensors --samples 1
 `cost` starts a cluster of one and of two workers, has it run empty tasks, and does both jobs, which are done
 in a process without an engine as well; `worker` and `node` kill while the jobs run; `serve`, `serve_own`,
 `serve_node` and `cut` kill or cut off who serves four keys (`quick`: with short timeouts), `actor` kills an
-actor of Dask. Those with nodes need the right to make network namespaces. Each thread of BLAS is alone.
+actor of Dask; `install` makes an environment. Those with nodes need the right to make network namespaces. Each thread of BLAS is alone.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,10 +29,11 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
 from streamfeat.machine import Disturbance, describe_machine  # noqa: E402
-from tools.compare_clusters import live, nodes, offline, work  # noqa: E402
+from tools.compare_clusters import installed, live, nodes, offline, work  # noqa: E402
 from tools.compare_clusters.engines import QUICK  # noqa: E402
 
 MEASUREMENTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
+    "install": installed.install,
     "cost": offline.cost,
     "worker": offline.worker_killed,
     "node": offline.node_killed,
@@ -70,9 +72,7 @@ def main() -> None:
         parser.error("none of the engines is installed: pip install ray distributed")
     with tempfile.TemporaryDirectory(prefix="clusters") as name:
         folder = Path(name)
-        work.split_recording(
-            arguments.recording, arguments.model, folder, arguments.samples, arguments.each
-        )
+        work.split_recording(arguments.recording, arguments.model, folder, arguments.samples, arguments.each)
         runs = _all_runs(arguments, engines, folder)
     report = {"machine": describe_machine(), "load": os.getloadavg()[0], "runs": runs}
     if arguments.json:
@@ -89,12 +89,25 @@ def _all_runs(arguments: argparse.Namespace, engines: list[str], folder: Path) -
             if what == "cost":
                 cases = [("none", 1), *((engine, n) for n in (1, 2) for engine in engines)]
             for engine, workers in cases:
-                steal = Disturbance()
+                steal, cores = Disturbance(), _cores_given()
                 found = _in_child(what, engine, workers, folder, arguments)
                 run = {"what": what, "engine": engine, "workers": workers, "round": number} | found
-                runs.append(run | {"steal": round(steal.steal_share() or 0.0, 3)})
+                runs.append(run | {"cores": cores, "steal": round(steal.steal_share() or 0.0, 3)})
                 print(json.dumps(runs[-1]), file=sys.stderr, flush=True)
     return runs
+
+
+def _cores_given() -> float:
+    """How many cores two processes that only count get: a shared machine may have fewer than it shows."""
+
+    def seconds(n: int) -> float:
+        began = time.perf_counter()
+        counting = [sys.executable, "-S", "-c", "for i in range(15_000_000): pass"]
+        for process in [subprocess.Popen(counting) for _ in range(n)]:
+            process.wait(_LIMIT_S)
+        return time.perf_counter() - began
+
+    return round(2 * seconds(1) / seconds(2), 2)
 
 
 def _in_child(
@@ -107,7 +120,7 @@ def _in_child(
     short = tempfile.mkdtemp(prefix="r")
     for path in (*parts.glob("*.mcap"), *parts.glob("*.npy")):
         (folder / path.name).hardlink_to(path)
-    one = "OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS NUMBA_NUM_THREADS".split()
+    one = [f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")]
     environment = os.environ | dict.fromkeys(one, "1")
     # Its own token, or Ray writes one into the home folder; and no reports to its makers.
     environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
@@ -140,7 +153,7 @@ def _child(arguments: argparse.Namespace) -> None:
     arguments.workers, arguments.folder = int(workers), folder
     try:
         found = MEASUREMENTS[arguments.what[0]](engine, arguments)
-    except nodes.Skipped as why:
+    except nodes.NotHereError as why:
         found = {"skipped": str(why)}
     print(json.dumps(found), flush=True)
 

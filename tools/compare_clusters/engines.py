@@ -13,14 +13,15 @@ STORE_BYTES = 256 * 2**20
 """Of Ray's shared memory; by default it takes 30 % of what the machine has."""
 
 QUICK = {
-    "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP": "3s",
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP": "12s",
     "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "4s",
     "RAY_health_check_initial_delay_ms": "1000",
     "RAY_health_check_period_ms": "500",
     "RAY_health_check_timeout_ms": "1000",
     "RAY_health_check_failure_threshold": "3",
 }
-"""Settings with which each should notice within 5 s that a node cannot be reached."""
+"""Settings with which each should soon notice that a node cannot be reached: Dask refuses less than 11 s for
+a connection, and waits for ten heartbeats of half a second whatever the time to live."""
 
 
 class Engine(Protocol):
@@ -63,8 +64,8 @@ class OnRay:
         self._ray = ray
         here: dict[str, Any] = {"address": address, "_node_ip_address": (address or "").split(":")[0]}
         if address is None:
-            here = {"address": "local", "num_cpus": workers, "num_gpus": 0, "object_store_memory": STORE_BYTES}
-            here |= {"include_dashboard": False}
+            here = {"address": "local", "num_cpus": workers, "num_gpus": 0}
+            here |= {"include_dashboard": False, "object_store_memory": STORE_BYTES}
         ray.init(log_to_driver=False, logging_level="ERROR", **here)
         if address:
             until(lambda: sum(node["Alive"] for node in ray.nodes()) >= workers, "its nodes")

@@ -8,6 +8,7 @@ import signal
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def node_cut_off(engine: str, arguments: Namespace) -> dict[str, Any]:
 def dask_actor_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
     """The same with an actor of Dask: what becomes of it, in its own words."""
     if engine != "dask":
-        raise nodes.Skipped("Ray's servers are actors already")
+        raise nodes.NotHereError("Ray's servers are actors already")
     one: Any = started("dask", 2, servers=len(KEYS))
     folder = Path(arguments.folder)
     try:
@@ -144,7 +145,7 @@ def _watched(folder: Path, victims: set[int], strike: Callable[[], None]) -> dic
 def _overlap(folder: Path, key: str) -> float:
     """Seconds in which a key was served by two processes at once."""
     spans = sorted((times[0], times[-1]) for times in work.beats(folder, key).values() if len(times))
-    return max([0.0, *(min(a[1], b[1]) - b[0] for a, b in zip(spans, spans[1:], strict=False))])
+    return max([0.0, *(min(a[1], b[1]) - b[0] for a, b in pairwise(spans))])
 
 
 def _ended(folder: Path, one: Engine, handles: list[Any]) -> dict[str, Any]:
@@ -154,4 +155,3 @@ def _ended(folder: Path, one: Engine, handles: list[Any]) -> dict[str, Any]:
         return {"ended": sorted(one.results(handles)) == list(KEYS)}
     except Exception as error:
         return {"ended": f"{type(error).__name__}: {error}".splitlines()[0][:200]}
-

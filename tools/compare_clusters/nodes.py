@@ -28,7 +28,7 @@ _SETUP = (
 _RAY = ["--num-cpus=2", "--object-store-memory=200000000", "--disable-usage-stats", "--block"]
 
 
-class Skipped(Exception):
+class NotHereError(Exception):
     """This machine cannot do it, for the reason given."""
 
 
@@ -60,13 +60,13 @@ def two(engine: str, folder: Path, threads: int = 1) -> Iterator[Two]:
         threads: of a Dask worker: as many functions that run for ever fit in.
 
     Raises:
-        Skipped: there can be no namespace here.
+        NotHereError: there can be no namespace here.
     """
     with contextlib.ExitStack() as stack:
         stack.callback(_run, f"ip netns del {SPACE}")
         for command in _SETUP:
             if problem := _run(command):
-                raise Skipped(f"{command}: {problem}")
+                raise NotHereError(f"{command}: {problem}")
         address = f"{HERE}:{PORT}" if engine == "ray" else f"tcp://{HERE}:{PORT}"
         inside = ["ip", "netns", "exec", SPACE]
         both = Two(address)
@@ -111,11 +111,11 @@ def _until_listening(port: int, log: Path, process: subprocess.Popen[bytes]) -> 
             return
         time.sleep(0.1)
     said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:]
-    raise Skipped(f"the first node did not come up: exit status {process.poll()}, {said}")
+    raise NotHereError(f"the first node did not come up: exit status {process.poll()}, {said}")
 
 
 def connections() -> list[str]:
-    """Between the two nodes, who connected to which listening port."""
+    """Between the two nodes, which listening ports have been connected to."""
     listening = {}
     for space, prefix in ((HERE, []), (THERE, ["ip", "netns", "exec", SPACE])):
         ss = subprocess.run([*prefix, "ss", "-ltnH"], capture_output=True, text=True, timeout=20)
@@ -123,10 +123,10 @@ def connections() -> list[str]:
     ss = subprocess.run(["ss", "-tnH"], capture_output=True, text=True, timeout=20)
     found = set()
     for line in ss.stdout.splitlines():
-        (one, first), (other, second) = (end.replace("[::ffff:", "").rpartition(":")[::2] for end in line.split()[3:5])
-        if {one.strip("]"), other.strip("]")} == {HERE, THERE}:
-            mine = first in listening[HERE]
-            found.add(f"{'here' if mine else 'there'}:{first if mine else second}")
+        ends = [end.replace("[::ffff:", "").replace("]", "").rpartition(":") for end in line.split()[3:5]]
+        if {host for host, _, _ in ends} == {HERE, THERE}:
+            (_, _, mine), (_, _, theirs) = ends
+            found.add(f"here:{mine}" if mine in listening[HERE] else f"there:{theirs}")
     return sorted(found)
 
 

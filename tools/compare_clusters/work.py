@@ -123,9 +123,7 @@ def encode_all(submit: Callable[..., Any], folder: Path, model: Path) -> Any:
 
 def sum_all(submit: Callable[..., Any], folder: Path, model: Path) -> Any:
     """The same for one pass of learning."""
-    return tree(
-        submit, [submit(sum_chunk, folder, i, model, folder / _LOG) for i in range(n_chunks(folder))]
-    )
+    return tree(submit, [submit(sum_chunk, folder, i, model, folder / _LOG) for i in range(n_chunks(folder))])
 
 
 def ran(folder: Path) -> list[tuple[str, int]]:
