@@ -6,7 +6,8 @@ python tools/compare_clusters all -r ncars.mcap -m model.safetensors --samples 1
 `cost` starts a cluster of one and of two workers, has it run empty tasks, and does both jobs, which are done
 in a process without an engine as well; `worker` and `node` kill while the jobs run; `serve`, `serve_own`,
 `serve_node` and `cut` kill or cut off who serves four keys (`quick`: with short timeouts), `actor` kills an
-actor of Dask; `install` makes an environment. Those with nodes need the right to make network namespaces. Each thread of BLAS is alone.
+actor of Dask; `install` makes an environment. Those with nodes need the right to make network namespaces.
+BLAS has one thread in each process. `cores` is what two processes got that only count, before a run.
 """
 
 import argparse

@@ -3,6 +3,7 @@
 Lives here: measurements that one child process makes of one engine, from nothing.
 """
 
+import contextlib
 import hashlib
 import os
 import signal
@@ -92,18 +93,19 @@ def _timed(
                 return
 
     watcher = threading.Thread(target=watch) if kill else None
-    began = time.perf_counter()
+    began, processor = time.perf_counter(), _processor_s()
     if watcher:
         watcher.start()
     try:
         (result,) = one.results([JOBS[name](one.submit, folder, Path(arguments.model))])
         spent = time.perf_counter() - began
+        processor = _processor_s() - processor
     finally:
         stopped.set()
         if watcher:
             watcher.join()
     digest = hashlib.sha256(b"".join(result[key].tobytes() for key in sorted(result)))
-    return {"s": spent, "tasks": len(work.ran(folder)), "digest": digest.hexdigest()[:16]}
+    return {"s": spent, "processor_s": processor, "tasks": len(work.ran(folder)), "digest": digest.hexdigest()[:16]}
 
 
 def _warm(one: Engine, arguments: Namespace) -> None:
@@ -113,6 +115,16 @@ def _warm(one: Engine, arguments: Namespace) -> None:
     log, part = folder / "warm.txt", work.parts_of(folder)[0]
     one.results([one.submit(work.encode_part, part, model, log) for _ in range(4)])
     one.results([one.submit(work.sum_chunk, folder, 0, model, log) for _ in range(4)])
+
+
+def _processor_s() -> float:
+    """What this process and all that come from it have used, which no other machine's load changes."""
+    total = 0
+    for pid in nodes.family(os.getpid()):
+        with contextlib.suppress(OSError):
+            words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            total += int(words[11]) + int(words[12])
+    return total / os.sysconf("SC_CLK_TCK")
 
 
 def _pss(pid: int) -> float:
