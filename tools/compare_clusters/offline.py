@@ -105,7 +105,12 @@ def _timed(
         if watcher:
             watcher.join()
     digest = hashlib.sha256(b"".join(result[key].tobytes() for key in sorted(result)))
-    return {"s": spent, "processor_s": processor, "tasks": len(work.ran(folder)), "digest": digest.hexdigest()[:16]}
+    return {
+        "s": spent,
+        "processor_s": processor,
+        "tasks": len(work.ran(folder)),
+        "digest": digest.hexdigest()[:16],
+    }
 
 
 def _warm(one: Engine, arguments: Namespace) -> None:
