@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -54,19 +54,21 @@ def worker_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
 
 
 def node_killed(engine: str, arguments: Namespace) -> dict[str, Any]:
-    """SIGKILL for all processes of one of two nodes."""
+    """SIGKILL for all processes of one of two nodes, which does not come back: one job, therefore."""
     with nodes.two(engine, Path(arguments.folder)) as two:
         one = started(engine, 2, address=two.address)
         try:
-            return _disturbed(one, arguments, lambda pid: two.kill())
+            return _disturbed(one, arguments, lambda pid: two.kill(), ["encode"])
         finally:
             one.stop()
 
 
-def _disturbed(one: Engine, arguments: Namespace, kill: Callable[[int], None]) -> dict[str, Any]:
+def _disturbed(
+    one: Engine, arguments: Namespace, kill: Callable[[int], None], jobs: Iterable[str] = JOBS
+) -> dict[str, Any]:
     _warm(one, arguments)
     found: dict[str, Any] = {}
-    for name in JOBS:
+    for name in jobs:
         calm = _timed(one, name, arguments)
         killed = _timed(one, name, arguments, kill)
         found[f"{name}_calm_s"] = calm["s"]
