@@ -1,4 +1,4 @@
-"""What `tools/compare_clusters` measures of an engine, where one is installed: its results come back."""
+"""What `tools/compare_clusters` measures of an engine, where one is installed: what it served is served again."""
 
 import json
 import os
@@ -10,42 +10,26 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = {"ray": "ray", "dask": "distributed"}
+MODULES = {"dask": "distributed", "ray": "ray"}
 
 
-@pytest.fixture(params=MODULES)
-def measured(request, tmp_path):
-    """Has the tool measure one engine, and gives the one run that it writes down."""
-    if not find_spec(MODULES[request.param]):
-        pytest.skip(f"{MODULES[request.param]} is not installed")
-
-    def measure(what):
-        words = [what, "--engines", request.param, "--samples", "60", "--each", "5"]
-        found = subprocess.run(
-            [sys.executable, ROOT / "tools" / "compare_clusters", *words, "--json", tmp_path / "out.json"],
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            text=True,
-            timeout=300,
-        )
-        assert found.returncode == 0, found.stderr
-        (run,) = json.loads((tmp_path / "out.json").read_text())["runs"]
-        assert "failed" not in run, run
-        return run
-
-    return measure
-
-
-def test_a_killed_worker_costs_tasks_and_changes_no_bit(measured):
-    run = measured("worker")
-    assert run["encode_same"] is True
-    assert run["sums_same"] is True
-    assert run["encode_again"] >= 0
-
-
-def test_who_served_the_keys_of_a_killed_process_is_replaced(measured):
-    run = measured("serve")
+def test_who_served_the_keys_of_a_killed_process_is_replaced(tmp_path):
+    engine = next((name for name, module in MODULES.items() if find_spec(module)), None)
+    if engine is None:
+        pytest.skip("neither distributed nor ray is installed")
+    out = tmp_path / "out.json"
+    words = ["serve", "--engines", engine, "--samples", "20", "--json", out]
+    found = subprocess.run(
+        [sys.executable, ROOT / "tools" / "compare_clusters", *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        timeout=300,
+    )
+    assert found.returncode == 0, found.stderr
+    (run,) = json.loads(out.read_text())["runs"]
+    assert "failed" not in run, run
     assert run["hit"] >= 1
     assert run["again_s"] is not None
     assert run["ended"] is True
