@@ -1,4 +1,4 @@
-"""What `tools/compare_clusters` measures of an engine, where one is installed: what it served is served again."""
+"""What `tools/compare_clusters` measures of an engine, where one is installed: keys are served again."""
 
 import json
 import os
