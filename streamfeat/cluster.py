@@ -7,6 +7,7 @@ Every function that is sent is a function of its arguments alone, and what goes 
 scheduler: what a worker that dies has held is computed again on another from there.
 """
 
+import os
 import platform
 import uuid
 from collections import deque
@@ -74,6 +75,10 @@ class Cluster:
         """How many work, and where Dask shows what they do."""
         threads = self._client.nthreads().values()
         return f"{len(threads)} workers, {sum(threads)} threads; dashboard: {self._client.dashboard_link}"
+
+    def processes(self) -> dict[str, int]:
+        """The process number of each worker, by its address."""
+        return dict(self._client.run(os.getpid))
 
     def map(
         self, function: Callable[..., R], pieces: Iterable[tuple[Any, ...]], *common: Any

@@ -44,10 +44,6 @@ def two():
         yield cluster
 
 
-def pids(cluster):
-    return list(cluster._client.run(os.getpid).values())
-
-
 def learned(workers, formulation="direct", report=lambda *step: None):
     with open_recording(TRAIN) as recording:
         assert len(recording.parts()) > 1
@@ -143,7 +139,7 @@ def test_a_conversion_is_the_same(two, tmp_path):
 
 
 def test_a_worker_that_dies_while_learning_changes_nothing(two):
-    before = pids(two)
+    before = [*two.processes().values()]
 
     def kill(step, done, total, remark):
         if (step, done) == ("learning", 1) and before:
@@ -155,7 +151,7 @@ def test_a_worker_that_dies_while_learning_changes_nothing(two):
 
 def test_a_worker_that_dies_while_evaluating_changes_nothing(two, animals):
     expected = evaluated(animals, Here(1))
-    before = pids(two)
+    before = [*two.processes().values()]
     alive = len(before)
     found = evaluated(animals, two, lambda row: before and os.kill(before.pop(), signal.SIGKILL))
     assert found == expected

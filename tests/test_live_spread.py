@@ -85,7 +85,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
             until(lambda: all(one.now.get("packets") for one in job.cameras.values()), "counts of each")
             addresses = {one.worker for one in job.cameras.values()}
             assert len(addresses) == 2, "the cameras are spread"
-            pids = two._client.run(os.getpid)
+            pids = two.processes()
             victim = sorted(addresses)[0]
             mourned = [topic for topic, one in job.cameras.items() if one.worker == victim]
             os.kill(pids[victim], signal.SIGKILL)

@@ -43,8 +43,7 @@ def split_recording(recording: Path, model: Path, folder: Path, samples: int, ea
                     out.write_label(sample.label)
                     out.write_events(sample.events, sample.resolution)
         windows = islice(windows_of(source.items(), encoder.geometry), samples)
-        rng = np.random.default_rng(0)
-        volumes = sample_volumes(windows, encoder.geometry, 64 * samples, rng)
+        volumes = sample_volumes(windows, encoder.geometry, 64 * samples, (0,))
     np.save(folder / _VOLUMES, volumes.counts)
 
 
