@@ -2,8 +2,8 @@
 
     python tools/cluster_bench.py -r ncars.mcap --samples 8000
 
-Rounds of: this process; one worker with as many threads; one worker with one thread; two with one thread each.
-Then a worker is killed while it learns, and one while it encodes. N-CARS comes from `streamfeat convert`;
+Rounds of: this process; one worker with as many threads; one worker with one thread; two with one each. Then
+a worker is killed while it learns, and one while it encodes. N-CARS comes from `streamfeat convert`;
 without `-r` the shipped digits are used, which are too few for times that mean much.
 """
 
@@ -52,6 +52,8 @@ class Found:
     encode_s: float
     encoder: Encoder
     samples: EncodedSamples
+    most_mb: int = 0
+    """The most memory that a worker held."""
 
     def same_as(self, other: "Found") -> bool:
         return bool(
@@ -91,6 +93,11 @@ def first_samples(path: Path, n: int) -> Iterator[Path]:
         few.unlink(missing_ok=True)
 
 
+def peak_mb(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) // 1024
+
+
 def kill_at(
     place: Cluster, step: str, at: Callable[[int, int], bool]
 ) -> tuple[Callable[..., None], list[int]]:
@@ -105,13 +112,16 @@ def kill_at(
     return report, killed
 
 
-def rounds_of(path: Path, setting: Setting, n: int) -> dict[str, list[Found]]:
+def rounds_of(path: Path, warm: Path, setting: Setting, n: int) -> dict[str, list[Found]]:
     found: dict[str, list[Found]] = {name: [] for name in PLACES}
+    few = replace(setting, iterations=1, volumes=1000)
     for number in range(n):
         for name, make in PLACES.items():
             with make() as place:
-                run(path, replace(setting, iterations=1), place)  # kernels are there, and files in memory
-                found[name].append(run(path, setting, place))
+                run(warm, few, place)  # kernels are loaded
+                one = run(path, setting, place)
+                workers = place.processes().values() if isinstance(place, Cluster) else ()
+                found[name].append(replace(one, most_mb=max(map(peak_mb, workers), default=0)))
             one = found[name][-1]
             print(f"round {number + 1}: {name}: {one.learn_s:.1f} s, {one.encode_s:.1f} s", file=sys.stderr)
     return found
@@ -154,8 +164,11 @@ def main() -> None:
     names = ("formulation", "filters", "patch", "volumes", "iterations")
     setting = Setting(stride=4, **{name: getattr(given, name) for name in names})
     disturbance = Disturbance()
-    with first_samples(given.recording, given.samples) as path:
-        found = rounds_of(path, setting, given.rounds)
+    with (
+        first_samples(given.recording, given.samples) as path,
+        first_samples(given.recording, 100) as warm,
+    ):
+        found = rounds_of(path, warm, setting, given.rounds)
         here = found["this process"][0]
         killed = killed_runs(path, setting, here)
     figures: dict[str, Any] = {"samples": len(here.samples.labels), "killed": killed, "places": {}}
@@ -164,29 +177,29 @@ def main() -> None:
             "learn_s": round(statistics.median(one.learn_s for one in several), 2),
             "encode_s": round(statistics.median(one.encode_s for one in several), 2),
             "same": all(one.same_as(here) for one in several),
+            "most_mb": max(one.most_mb for one in several),
             "difference": max(one.difference(here) for one in several),
         }
     figures["most_mb_here"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    figures["most_mb_of_a_worker"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024
     figures["steal"] = disturbance.steal_share()
     if given.json:
         print(json.dumps(figures))
         return
-    print(
-        f"{figures['samples']} samples, K = {given.filters}, {given.volumes} volumes, {given.iterations} iterations"
-    )
-    print(
-        f"steal {figures['steal'] or 0:.1%}; most memory here {figures['most_mb_here']} MB, of a worker "
-        f"{figures['most_mb_of_a_worker']} MB\n"
-    )
-    print("| where | learn, s | encode, s | same bits |\n| --- | ---: | ---: | --- |")
+    show(figures, setting)
+
+
+def show(figures: dict[str, Any], setting: Setting) -> None:
+    how = f"K = {setting.filters}, {setting.volumes:,} volumes, {setting.iterations} iterations"
+    print(f"{figures['samples']} samples, {how}; steal {figures['steal'] or 0:.1%}; ", end="")
+    print(f"this process held {figures['most_mb_here']} MB at most\n")
+    print("| where | learn, s | encode, s | most MB of a worker | same bits |")
+    print("| --- | ---: | ---: | ---: | --- |")
     for name, row in figures["places"].items():
-        print(f"| {name} | {row['learn_s']:.1f} | {row['encode_s']:.1f} | {'yes' if row['same'] else 'NO'} |")
-    for step, row in killed.items():
-        print(
-            f"| a worker of two killed while {step} | {row['learn_s']:.1f} | {row['encode_s']:.1f} | "
-            f"{'yes' if row['same'] and row['killed'] else 'NO'} |"
-        )
+        times = f"{row['learn_s']:.1f} | {row['encode_s']:.1f}"
+        print(f"| {name} | {times} | {row['most_mb'] or ''} | {'yes' if row['same'] else 'NO'} |")
+    for step, row in figures["killed"].items():
+        times, same = f"{row['learn_s']:.1f} | {row['encode_s']:.1f}", row["same"] and row["killed"]
+        print(f"| a worker of two killed while {step} | {times} | | {'yes' if same else 'NO'} |")
 
 
 if __name__ == "__main__":
