@@ -9,12 +9,14 @@ scheduler: what a worker that dies has held is computed again on another from th
 
 import os
 import platform
+import signal
 import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
+from threading import current_thread, main_thread
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -284,15 +286,29 @@ def local(n_workers: int, threads: int | None = None) -> Iterator[Cluster]:
         raise InputError(f"{n_workers} workers cannot do anything; give at least one")
     threads = threads or max(1, dask.system.CPU_COUNT // n_workers)
     with dask.config.set(_SETTINGS), _one_line():
-        cluster = LocalCluster(
-            n_workers=n_workers,
-            threads_per_worker=threads,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs="CRITICAL",
-        )
+        with _ctrl_c_ignored():
+            cluster = LocalCluster(
+                n_workers=n_workers,
+                threads_per_worker=threads,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                silence_logs="CRITICAL",
+            )
         with cluster, Client(cluster, set_as_default=False) as client:
             yield Cluster(client)
+
+
+@contextmanager
+def _ctrl_c_ignored() -> Iterator[None]:
+    """Processes that are started here do not hear Ctrl-C of the terminal; whoever started them ends them."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _versions() -> dict[str, str]:

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from live_net import free_port
 
 from streamfeat.cluster import connected, local
+from streamfeat.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
 from streamfeat.evaluate.run import evaluate
@@ -247,6 +248,23 @@ def test_a_piece_that_cannot_be_read_is_one_line_with_the_worker(two):
     assert [next(found) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(InputError, match=r"no disk on \S+ \(on worker tcp://127.0.0.1:\d+\)"):
         next(found)
+
+
+def test_ctrl_c_keeps_what_was_learned_and_ends_quietly(tmp_path):
+    small = [str(word) for name, value in SMALL.items() for word in (f"--{name}", value)]
+    words = ["learn", str(TRAIN), "-o", str(tmp_path / "model"), "--workers", "2", "--verbose", *small]
+    code = "from streamfeat.cli import main; main()"
+    command = [sys.executable, "-c", code, *words, "--iterations", "100000"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=-3, text=True, start_new_session=True
+    ) as it:
+        next(line for line in it.stderr if line.startswith("learning"))
+        os.killpg(it.pid, signal.SIGINT)  # as a terminal does: to all of them
+        said = it.stderr.read()
+    assert it.returncode == 130
+    assert "interrupted after" in said
+    assert "Traceback" not in said
+    assert Encoder.load(tmp_path / "model").provenance["interrupted"]
 
 
 def deadly(piece):
