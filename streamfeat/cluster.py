@@ -7,6 +7,8 @@ Every function that is sent is a function of its arguments alone, and what goes 
 scheduler: what a worker that dies has held is computed again on another from there.
 """
 
+import functools
+import itertools
 import os
 import platform
 import signal
@@ -88,7 +90,7 @@ class Cluster:
         """See `Workers`."""
         source = iter(pieces)
         with _one_line():
-            n = _AHEAD * max(1, sum(self._client.nthreads().values()))
+            n = _AHEAD * self._threads()
 
             def begin(n: int) -> Iterator[Future]:
                 return (self._submit(function, *piece, *common) for piece in islice(source, n))
@@ -116,15 +118,10 @@ class Cluster:
     def total(self, function: Callable[..., Sums], held: Sequence[tuple[Any, ...]], *common: Any) -> Sums:
         """See `Workers`; sums are added on the workers, and those that can be are added first."""
         with _one_line():
-            level = [self._submit(function, *values, *common) for values in held]
+            together = _FAN_IN if len(held) >= _AHEAD * _FAN_IN * self._threads() else 1
+            level = [self._part_of_total(function, group, common) for group in _groups(held, together)]
             while len(level) > 1:
-                groups = [level[i : i + _FAN_IN] for i in range(0, len(level), _FAN_IN)]
-                level = [
-                    self._client.submit(add_sums, *group, pure=False, priority=1)
-                    if len(group) > 1
-                    else group[0]
-                    for group in groups
-                ]
+                level = [self._sum(group) for group in _groups(level, _FAN_IN)]
             sums: Sums = self._result(level[0])
             return sums
 
@@ -132,6 +129,10 @@ class Cluster:
         """See `Workers`."""
         with _one_line():
             return [self._submit(function, *values, *common) for values in held]
+
+    def _threads(self) -> int:
+        threads: int = sum(self._client.nthreads().values())
+        return max(1, threads)
 
     def _result(self, future: Future) -> Any:
         """Wait for a result, as long as there is somebody to work on it."""
@@ -142,7 +143,15 @@ class Cluster:
                 if future.status == "pending" and not self._client.nthreads():
                     raise InputError("no worker is left; their logs tell why") from None
 
+    def _part_of_total(
+        self, function: Callable[..., Sums], group: Sequence[tuple[Any, ...]], common: Sequence[Any]
+    ) -> Future:
+        own = itertools.chain(*group)
+        return self._submit(_total, function, len(group), len(group[0]), *own, *common)
+
     def _sum(self, parts: Sequence[Future]) -> Future:
+        if len(parts) == 1:
+            return parts[0]
         return self._client.submit(add_sums, *parts, pure=False, priority=1)
 
     def errands(self, on_told: "Callable[[str, str, dict[str, Any]], None]") -> "Errands":
@@ -311,6 +320,7 @@ def _ctrl_c_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     """Of all that decides what comes out."""
     return {
@@ -327,6 +337,16 @@ def _check(wanted: dict[str, str], found: dict[str, Any], address: str) -> None:
         if there != right:
             has = f"has {name} {there}" if there else f"does not have {name}"
             raise InputError(f"worker {address} {has}, here it is {right}; install the same on both")
+
+
+def _groups(values: Sequence[R], size: int) -> Iterator[Sequence[R]]:
+    return (values[i : i + size] for i in range(0, len(values), size))
+
+
+def _total(function: Callable[..., Sums], n: int, width: int, *values: Any) -> Sums:
+    """Add up `n` neighbours in the tree; of `values`, `width` are of each, and the others of all."""
+    own, common = values[: n * width], values[n * width :]
+    return add_sums(*(function(*one, *common) for one in _groups(own, width)))
 
 
 def _itself(value: Any) -> Any:

@@ -88,6 +88,11 @@ ROWS = {
         "test_torture.py::test_commands_that_are_killed",
     ],
     "`kill -9`, `convert` and `train`": ["test_torture.py::test_commands_that_are_killed"],
+    "`kill -9`, a worker of a cluster": [
+        "test_cluster.py::test_a_worker_that_dies_while_learning_changes_nothing",
+        "test_cluster.py::test_a_worker_that_dies_while_evaluating_changes_nothing",
+        "test_live_spread.py::test_cameras_of_a_worker_that_dies_are_served_again",
+    ],
 }
 
 
