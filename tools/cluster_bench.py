@@ -3,8 +3,8 @@
     python tools/cluster_bench.py -r ncars.mcap --samples 8000
 
 Rounds of: this process with all its cores, and with one thread; one worker with one thread; two with one
-each. Then a worker is killed while it learns, and one while it encodes. N-CARS comes from `streamfeat convert`;
-without `-r` the shipped digits are used, which are too few for times that mean much.
+each. Then a worker is killed while it learns, and one while it encodes. N-CARS comes from `streamfeat
+convert`; without `-r` the shipped digits are used, which are too few for times that mean much.
 """
 
 import argparse
