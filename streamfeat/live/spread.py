@@ -113,7 +113,10 @@ class Spread:
         checked: dict[str, Any] = {**given, "port": port, **options}
         Listen(names, **checked)
         self._names, self._cluster, self._say = names, cluster, say
-        self._files = {name: path.read_bytes() for name, path in given.items() if path}
+        # zenoh goes by the ending of the name.
+        self._files = {
+            name: (f"{name}{path.suffix}", path.read_bytes()) for name, path in given.items() if path
+        }
         self._options = {"port": port, **options}
         self._zenoh_config, self._port, self._state = zenoh_config, port, state
         self._stopped = threading.Event()
@@ -167,10 +170,13 @@ class Spread:
             "cameras": len(cameras),
             **totals,
             "missed": sum(served.missed for served, _ in cameras.values()),
+            "unheard": sum(served.first_unheard for served, _ in cameras.values()),
             "restarts": sum(max(0, served.starts - 1) for served, _ in cameras.values()),
             "interrupted": self.interrupted,
             "of_each": {
-                topic: counts | {"worker": served.worker, "starts": served.starts, "missed": served.missed}
+                topic: counts
+                | {"worker": served.worker, "starts": served.starts}
+                | {"missed": served.missed, "unheard": served.first_unheard}
                 for topic, (served, counts) in sorted(cameras.items())
             },
         }
@@ -184,14 +190,18 @@ class Spread:
 
 
 def _serve(
-    errand: Errand, names: Names, files: dict[str, bytes], options: dict[str, Any], state: Path | None
+    errand: Errand,
+    names: Names,
+    files: dict[str, tuple[str, bytes]],
+    options: dict[str, Any],
+    state: Path | None,
 ) -> dict[str, Any]:
     """Listen on one topic on a worker, until nobody wants it any more; what it has done."""
     with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
         given: dict[str, Any] = {**options}
-        for name, content in files.items():
-            given[name] = Path(folder, name)
-            given[name].write_bytes(content)
+        for argument, (name, content) in files.items():
+            given[argument] = Path(folder, name)
+            given[argument].write_bytes(content)
         if state:
             state.mkdir(parents=True, exist_ok=True)
             given["state"] = state / quote(names.expression, safe="")
