@@ -138,7 +138,14 @@ def test_one_camera_without_a_wildcard_needs_no_token_and_a_configuration_goes_a
 
 
 def told(packets, unheard=0, lost=0, **more):
-    return {"packets": packets, "unheard": unheard, "lost": lost, "dropped": 0, "events": 10 * packets, **more}
+    return {
+        "packets": packets,
+        "unheard": unheard,
+        "lost": lost,
+        "dropped": 0,
+        "events": 10 * packets,
+        **more,
+    }
 
 
 def test_what_a_dead_worker_may_have_lost_is_counted():
@@ -163,6 +170,10 @@ def test_what_a_state_has_kept_is_counted_once():
     one.hear("b", told(9, 5, 10))  # of the 10 the dead one had read 3, and lost 1
     assert (one.missed, one.first_unheard) == (0, 5)
     assert one.counts() | {"packets": 12, "events": 120, "lost": 7} == one.counts()
+    one.hear("c", told(10, 5, 12, begins=True))  # kept after the last that was told
+    one.hear("c", told(11, 5, 12))
+    assert one.missed == 0
+    assert one.counts() | {"packets": 14, "events": 140, "lost": 9} == one.counts()
     later = Served()
     later.hear("c", told(100, 5, begins=True))
     later.hear("c", told(103, 5, 2))

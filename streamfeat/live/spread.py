@@ -55,10 +55,11 @@ class Served:
         """Take in what a worker tells: when it begins what it goes on from, then what it has done."""
         if told.get("begins"):
             self.worker, self.starts, self._has_gone_on = worker, self.starts + 1, False
-            # What a state has kept, workers before have told already, or those of an earlier run have done.
-            self.past = {name: n - told.get(name, 0) for name, n in self.counts().items()}
             if self.starts == 1:
                 self.first_unheard = _reached(told)
+            if _reached(told) <= self._known():
+                # What a state has kept, the worker before has told already, or an earlier run has done.
+                self.past = {name: n - told.get(name, 0) for name, n in self.counts().items()}
             self.now = told
         elif worker == self.worker:  # and not one that was given up, and has not noticed
             self.now, before = told, self.now
@@ -68,13 +69,16 @@ class Served:
 
     def _close_gap(self, *, is_new: bool) -> None:
         """Count what nobody has, when a worker hears its first packet."""
-        gap = _reached(self.now) - _reached(self.counts()) - self.missed - self.first_unheard
+        gap = _reached(self.now) - self._known()
         if not is_new:
             # Since its state was kept, the worker before has read what this one takes for lost.
             self.past["lost"] += min(gap, 0)
         elif self.starts == 1:
             self.first_unheard = gap
         self.missed += max(gap, 0) if self.starts > 1 else 0
+
+    def _known(self) -> int:
+        return _reached(self.counts()) + self.missed + self.first_unheard
 
     def counts(self) -> dict[str, int]:
         """All workers together."""
