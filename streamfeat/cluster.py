@@ -163,7 +163,7 @@ class Cluster:
         return self._client.submit(_worked, self._versions, function, *values, pure=False, retries=2)
 
 
-class Unanswered(InputError):
+class UnansweredError(InputError):
     """A worker did not hear from the scheduler, and ended what nobody had ended."""
 
 
@@ -214,7 +214,7 @@ class Errands:
                     future.result()
             except InputError as error:
                 found[name] = str(error)
-                if isinstance(error, Unanswered) or isinstance(error.__cause__, KilledWorker):
+                if isinstance(error, UnansweredError) or isinstance(error.__cause__, KilledWorker):
                     future.retry()
                 else:
                     del self._futures[name]
@@ -270,7 +270,7 @@ def _errand(
     secede()  # a worker has room for many: they wait most of the time
     errand.tell(function(errand, *values))
     if errand.is_unanswered:
-        raise Unanswered(f"the scheduler did not answer worker {get_worker().address} for a while")
+        raise UnansweredError(f"the scheduler did not answer worker {get_worker().address} for a while")
 
 
 @contextmanager
