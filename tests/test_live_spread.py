@@ -104,6 +104,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
         assert counted + first == camera.sent
         assert one["starts"] == (2 if key in mourned else 1)
         assert bool(one["missed"] + one["lost"]) == (key in mourned)
+        assert one["incomplete"] > 0
     if keeps_state:
         assert len(list(state.iterdir())) == 4
     assert len([line for line in lines if "again on worker" in line]) == len(mourned)

@@ -133,7 +133,7 @@ class Spread:
         self._files = {
             name: (f"{name}{path.suffix}", path.read_bytes()) for name, path in given.items() if path
         }
-        self._options = {"port": port, **options}
+        self._options = {"port": port, "joins_late": True, **options}
         self._zenoh_config, self._port, self._state = zenoh_config, port, state
         self._stopped = threading.Event()
         self._lock = threading.Lock()
