@@ -163,6 +163,10 @@ class Cluster:
         return self._client.submit(_worked, self._versions, function, *values, pure=False, retries=2)
 
 
+class UnansweredError(InputError):
+    """A worker did not hear from the scheduler, and ended what nobody had ended."""
+
+
 class Errands:
     """Functions that run on workers until they are ended; one whose worker dies begins again on another.
 
@@ -198,7 +202,10 @@ class Errands:
             self._futures[name] = self._client.submit(_errand, *given, pure=False)
 
     def check(self) -> dict[str, str]:
-        """Why errands failed that were not ended, by name; those whose workers all died are begun again."""
+        """Why errands failed that were not ended, by name.
+
+        Those whose workers all died, or could not reach the scheduler, are begun again.
+        """
         failed = {name: future for name, future in self._futures.items() if future.status == "error"}
         found = {}
         for name, future in failed.items():
@@ -207,7 +214,7 @@ class Errands:
                     future.result()
             except InputError as error:
                 found[name] = str(error)
-                if isinstance(error.__cause__, KilledWorker):
+                if isinstance(error, UnansweredError) or isinstance(error.__cause__, KilledWorker):
                     future.retry()
                 else:
                     del self._futures[name]
@@ -236,6 +243,8 @@ class Errand:
         self._key = self._worker.get_current_task()
         self._id, self._name = run_id, name
         self._end = Event(run_id, client=get_client())
+        self.is_unanswered = False
+        """It ended because the scheduler did not answer: that may be there again, and take it for done."""
 
     def is_wanted(self) -> bool:
         """Whether nobody has ended it: neither whoever began it, nor the scheduler, nor the loss of both."""
@@ -245,6 +254,7 @@ class Errand:
         try:
             return not self._end.is_set()
         except (OSError, TimeoutError):
+            self.is_unanswered = True
             return False
 
     def tell(self, what: dict[str, Any]) -> None:
@@ -259,6 +269,8 @@ def _errand(
     errand = Errand(run_id, name)
     secede()  # a worker has room for many: they wait most of the time
     errand.tell(function(errand, *values))
+    if errand.is_unanswered:
+        raise UnansweredError(f"the scheduler did not answer worker {get_worker().address} for a while")
 
 
 @contextmanager

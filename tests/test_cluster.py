@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ import dask
 from distributed import get_worker
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from live_net import free_port
+from live_net import free_port, until
 
 from streamfeat.cluster import connected, local
 from streamfeat.encoder import Encoder
@@ -157,6 +158,27 @@ def test_a_worker_that_dies_while_evaluating_changes_nothing(two, animals):
     found = evaluated(animals, two, lambda row: before and os.kill(before.pop(), signal.SIGKILL))
     assert found == expected
     assert len(before) < alive
+
+
+def hears_nothing_at_first(errand, mark):
+    first = not mark.exists()
+    mark.touch()
+    errand.is_unanswered = first
+    while not first and errand.is_wanted():
+        time.sleep(0.05)
+    return {"first": first}
+
+
+def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(two, tmp_path):
+    told, reasons = [], {}
+    errands = two.errands(lambda name, worker, what: told.append((name, what["first"])))
+    errands.begin("a", hears_nothing_at_first, tmp_path / "mark")
+    until(lambda: reasons.update(errands.check()) or reasons, "that it failed")
+    assert "the scheduler did not answer worker tcp://127.0.0.1:" in reasons["a"]
+    until(lambda: errands._futures["a"].status == "pending", "its second beginning")
+    assert errands.check() == {}
+    errands.end()
+    until(lambda: told == [("a", True), ("a", False)], lambda: f"{told}")
 
 
 # --- what cannot be

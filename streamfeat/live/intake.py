@@ -98,6 +98,7 @@ class Intake:
         warnings: told what is refused and what is strange.
         silence_s: how long a camera must be silent before its time goes on without it.
         mark_s: how often to put a mark into the stream, if anything came meanwhile.
+        joins_late: packets before the first that is heard are missing from its window.
     """
 
     def __init__(
@@ -108,6 +109,7 @@ class Intake:
         *,
         silence_s: float = SILENCE_S,
         mark_s: float = math.inf,
+        joins_late: bool = False,
     ) -> None:
         """Nothing is taken before iteration."""
         self._inbox = inbox
@@ -119,7 +121,7 @@ class Intake:
         self._early: dict[str, Label] = {}
         self._leaving: dict[str, float] = {}
         self._awaited: dict[str, float] = {}
-        self._mark_s = mark_s
+        self._mark_s, self._joins_late = mark_s, joins_late
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
         """What is known of each topic, as JSON values."""
@@ -251,6 +253,7 @@ class Intake:
         self._awaited.pop(message.topic, None)
         attachment = Attachment.unpack(message.attachment)
         numbered = attachment or self._number_in(message)
+        unheard = state.delivery.stats.unheard
         verdict = state.delivery.see(numbered.gid, numbered.seq, message.arrived_ns, message.dropped)
         if verdict.broken:
             state.reader.resync()
@@ -259,6 +262,8 @@ class Intake:
             if verdict.anew:
                 yield self._release(message.topic, state)
         state.lost += verdict.lost
+        if self._joins_late:
+            state.lost += state.delivery.stats.unheard - unheard
         if verdict.foreign:
             self._warnings.add("second publisher", message.topic, numbered.gid.hex() or "unnamed")
         if not verdict.use:

@@ -69,6 +69,8 @@ class Listen:
         state_every_s: how often it is written.
         shard: the share of the cameras to serve; all without it.
         announced: serve those only that announce themselves; what others publish is not asked for.
+        joins_late: readings are incomplete until a window has passed, if packets were published before; as
+            of one who goes on with the cameras of another.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
 
@@ -95,6 +97,7 @@ class Listen:
         state_every_s: float = 1.0,
         shard: Shard | None = None,
         announced: bool = False,
+        joins_late: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
     ) -> None:
@@ -119,7 +122,8 @@ class Listen:
         self._inbox = Inbox(max_delay_s=max_delay_s)
         window_us = self._encoder.geometry.window_us
         mark_s = state_every_s if state else math.inf
-        self._intake = Intake(self._inbox, window_us, self._warnings, silence_s=silence_s, mark_s=mark_s)
+        options: dict[str, Any] = {"silence_s": silence_s, "mark_s": mark_s, "joins_late": joins_late}
+        self._intake = Intake(self._inbox, window_us, self._warnings, **options)
         self._cameras = Cameras(self._make_session, on_refusal=self._on_refusal)
         self.health = Health(self._cameras, self._intake, self._inbox, self._warnings)
         self._state = state

@@ -38,7 +38,8 @@ class Served:
         past: counts of the workers before.
         now: counts of this one, a quarter of a second old at most.
         missed: packets that were published between the last that a dead worker told of and the first that the
-            next one heard; some of them the dead one may have read without telling.
+            next one heard; some of them the dead one may have read without telling. One that goes on from a
+            state counts them as lost.
         first_unheard: packets that were published before the first worker heard any.
     """
 
@@ -48,30 +49,45 @@ class Served:
     now: dict[str, int] = field(default_factory=dict)
     missed: int = 0
     first_unheard: int = 0
-    _published: int = 0
+    _has_gone_on: bool = False
 
     def hear(self, worker: str, told: dict[str, Any]) -> None:
-        """Take in what a worker tells."""
+        """Take in what a worker tells: when it begins what it goes on from, then what it has done."""
         if told.get("begins"):
-            self.past = self.counts()
-            self._published = self._published_by(self.now)
-            self.now = {}
-            self.worker, self.starts = worker, self.starts + 1
-        else:
-            if not self.now.get("packets") and told["packets"]:
-                if self.starts == 1:
-                    self.first_unheard = told["unheard"]
-                else:
-                    self.missed += max(0, told["unheard"] - self._published)
+            self.worker, self.starts, self._has_gone_on = worker, self.starts + 1, False
+            if self.starts == 1:
+                self.first_unheard = _reached(told)
+            if _reached(told) <= self._known():
+                # What a state has kept, the worker before has told already, or an earlier run has done.
+                self.past = {name: n - told.get(name, 0) for name, n in self.counts().items()}
             self.now = told
+        elif worker == self.worker:  # and not one that was given up, and has not noticed
+            self.now, before = told, self.now
+            if not self._has_gone_on and told["packets"] > before.get("packets", 0):
+                self._has_gone_on = True
+                self._close_gap(is_new=not before.get("packets"))
+
+    def _close_gap(self, *, is_new: bool) -> None:
+        """Count what nobody has, when a worker hears its first packet."""
+        gap = _reached(self.now) - self._known()
+        if not is_new:
+            # Since its state was kept, the worker before has read what this one takes for lost.
+            self.past["lost"] += min(gap, 0)
+        elif self.starts == 1:
+            self.first_unheard = gap
+        self.missed += max(gap, 0) if self.starts > 1 else 0
+
+    def _known(self) -> int:
+        return _reached(self.counts()) + self.missed + self.first_unheard
 
     def counts(self) -> dict[str, int]:
         """All workers together."""
         return {name: self.past[name] + self.now.get(name, 0) for name in _COUNTS}
 
-    @staticmethod
-    def _published_by(counts: dict[str, int]) -> int:
-        return sum(counts.get(name, 0) for name in ("packets", "unheard", "lost", "dropped"))
+
+def _reached(counts: dict[str, Any]) -> int:
+    """How many packets were published until then, as far as these counts tell."""
+    return sum(counts.get(name, 0) for name in ("packets", "unheard", "lost", "dropped"))
 
 
 class Spread:
@@ -113,8 +129,11 @@ class Spread:
         checked: dict[str, Any] = {**given, "port": port, **options}
         Listen(names, **checked)
         self._names, self._cluster, self._say = names, cluster, say
-        self._files = {name: path.read_bytes() for name, path in given.items() if path}
-        self._options = {"port": port, **options}
+        # zenoh goes by the ending of the name.
+        self._files = {
+            name: (f"{name}{path.suffix}", path.read_bytes()) for name, path in given.items() if path
+        }
+        self._options = {"port": port, "joins_late": True, **options}
         self._zenoh_config, self._port, self._state = zenoh_config, port, state
         self._stopped = threading.Event()
         self._lock = threading.Lock()
@@ -167,10 +186,13 @@ class Spread:
             "cameras": len(cameras),
             **totals,
             "missed": sum(served.missed for served, _ in cameras.values()),
+            "unheard": sum(served.first_unheard for served, _ in cameras.values()),
             "restarts": sum(max(0, served.starts - 1) for served, _ in cameras.values()),
             "interrupted": self.interrupted,
             "of_each": {
-                topic: counts | {"worker": served.worker, "starts": served.starts, "missed": served.missed}
+                topic: counts
+                | {"worker": served.worker, "starts": served.starts}
+                | {"missed": served.missed, "unheard": served.first_unheard}
                 for topic, (served, counts) in sorted(cameras.items())
             },
         }
@@ -184,19 +206,23 @@ class Spread:
 
 
 def _serve(
-    errand: Errand, names: Names, files: dict[str, bytes], options: dict[str, Any], state: Path | None
+    errand: Errand,
+    names: Names,
+    files: dict[str, tuple[str, bytes]],
+    options: dict[str, Any],
+    state: Path | None,
 ) -> dict[str, Any]:
     """Listen on one topic on a worker, until nobody wants it any more; what it has done."""
     with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
         given: dict[str, Any] = {**options}
-        for name, content in files.items():
-            given[name] = Path(folder, name)
-            given[name].write_bytes(content)
+        for argument, (name, content) in files.items():
+            given[argument] = Path(folder, name)
+            given[argument].write_bytes(content)
         if state:
             state.mkdir(parents=True, exist_ok=True)
             given["state"] = state / quote(names.expression, safe="")
         job = Listen(names, **given)
-        errand.tell({"begins": True})
+        errand.tell({"begins": True, **job.result()})
         with _Telling(errand, job):
             job.run()
         return job.result()

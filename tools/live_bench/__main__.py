@@ -19,6 +19,7 @@ from tools.live_bench import faults  # noqa: E402
 from tools.live_bench.latency import measure_latency  # noqa: E402
 from tools.live_bench.rates import measure_rate  # noqa: E402
 from tools.live_bench.shards import measure_shards  # noqa: E402
+from tools.live_bench.workers import CASES, measure_workers, table  # noqa: E402
 
 MEASUREMENTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "latency": measure_latency,
@@ -28,6 +29,7 @@ MEASUREMENTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "router": faults.router_killed,
     "stopped": faults.subscriber_stopped,
     "cut": faults.network_cut,
+    "workers": measure_workers,
 }
 
 
@@ -42,13 +44,18 @@ def main() -> None:
     add("--seconds", type=float, default=10.0, help="of latency and rate (default: %(default)s)")
     add("--cut", type=float, default=5.0, help="seconds of SIGSTOP, and of the cut (default: %(default)s)")
     add("--first-rate", type=float, default=500_000, help="events a second (default: %(default)s)")
+    add("--rounds", type=int, default=3, help="of each case of workers (default: %(default)s)")
+    add("--cases", nargs="+", choices=list(CASES), help="of workers (default: all)")
+    add("--json", action="store_true", help="workers too as JSON, with every round, instead of a table")
     add("--port", type=int, default=17470, help="and the ones after it (default: %(default)s)")
     arguments = parser.parse_args()
     load = os.getloadavg()[0]
     print(json.dumps({"cores": os.cpu_count(), "load before": load, "python": sys.version.split()[0]}))
     for name in MEASUREMENTS if "all" in arguments.what else arguments.what:
         arguments.port += 10
-        print(json.dumps({name: MEASUREMENTS[name](arguments)}), flush=True)
+        result = MEASUREMENTS[name](arguments)
+        shown = table(result) if name == "workers" and not arguments.json else json.dumps({name: result})
+        print(shown, flush=True)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from tools.live_bench.processes import (
     zenoh_config,
 )
 
-_ROUTER = """
+ROUTER = """
 import sys, zenoh
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
 print("ready", flush=True)
@@ -71,7 +71,7 @@ def router_killed(arguments: Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         path = Path(name) / "client.json5"
         path.write_text(zenoh_config("client", connect=[address]))
-        router = stack.enter_context(process(sys.executable, "-c", _ROUTER, config))
+        router = stack.enter_context(process(sys.executable, "-c", ROUTER, config))
         router.stdout.readline()
         session = stack.enter_context(open_session(path))
         reader = Reader(session)
@@ -81,7 +81,7 @@ def router_killed(arguments: Namespace) -> dict[str, Any]:
         router.kill()
         router.wait()
         time.sleep(1)
-        again = stack.enter_context(process(sys.executable, "-c", _ROUTER, config))
+        again = stack.enter_context(process(sys.executable, "-c", ROUTER, config))
         again.stdout.readline()
         back = time.perf_counter()
         recovered = reader.next_after(back, 30)

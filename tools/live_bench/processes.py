@@ -27,7 +27,7 @@ from streamfeat.recording import open_recording
 FRAME = (100, 120)
 """All samples are shown on one sensor of this size."""
 KEY = "bench/cam/events"
-_PROGRAM = [sys.executable, "-c", "from streamfeat.cli import main; main()"]
+PROGRAM = [sys.executable, "-c", "from streamfeat.cli import main; main()"]
 
 Process = subprocess.Popen[str]
 
@@ -111,7 +111,7 @@ def process(*words: object, prefix: Sequence[str] = ()) -> Iterator[Process]:
 
 def streamfeat(*words: object, prefix: Sequence[str] = ()) -> contextlib.AbstractContextManager[Process]:
     """One of our commands, as a process."""
-    return process(*_PROGRAM, *words, prefix=prefix)
+    return process(*PROGRAM, *words, prefix=prefix)
 
 
 @contextlib.contextmanager
