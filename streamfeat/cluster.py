@@ -1,7 +1,8 @@
 """Work on other processes and machines, by Dask.
 
-Lives here: what streamfeat asks of a Dask cluster, and what it says when that fails.
-Not here: what the work is; which worker does it, and what is done again when one dies, Dask decides.
+Lives here: pieces of work that end, and what is said when they fail.
+Not here: work that does not end by itself (`errands`), and what the work is; which worker does it, and what
+is done again when one dies, Dask decides.
 
 Every function that is sent is a function of its arguments alone, and what goes into the first is kept by the
 scheduler: what a worker that dies has held is computed again on another from there.
@@ -12,7 +13,6 @@ import itertools
 import os
 import platform
 import signal
-import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ from streamfeat.workers import Sums, add_sums, one_blas_thread
 
 try:
     import dask
-    from distributed import Client, Event, Future, LocalCluster, get_client, get_worker, secede, wait
+    from distributed import Client, Future, LocalCluster, get_worker
     from distributed.client import FutureCancelledError
     from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
@@ -36,7 +36,7 @@ except ImportError as error:  # pragma: no cover
         f"{error}; other processes and machines need: pip install 'streamfeat[cluster]'"
     ) from error
 
-__all__ = ["Cluster", "connected", "local"]
+__all__ = ["Cluster", "check_versions", "connected", "local", "one_line", "versions_here"]
 
 R = TypeVar("R")
 
@@ -58,6 +58,10 @@ class Cluster:
 
     Args:
         client: connected.
+
+    Attributes:
+        client: the same.
+        versions: of what decides, here, what comes out.
     """
 
     def __init__(self, client: Client) -> None:
@@ -66,30 +70,30 @@ class Cluster:
         Raises:
             InputError: there is no worker, or one has another version of what computes.
         """
-        self._client = client
-        self._versions = _versions()
-        with _one_line():
+        self.client = client
+        self.versions = versions_here()
+        with one_line():
             client.wait_for_workers(1, timeout=_PATIENCE_S)
             workers = client.get_versions(packages=list(_PACKAGES))["workers"]
         for address, found in workers.items():
-            _check(self._versions, found["packages"], address)
+            check_versions(self.versions, found["packages"], address)
 
     @property
     def description(self) -> str:
         """How many work, and where Dask shows what they do."""
-        threads = self._client.nthreads().values()
-        return f"{len(threads)} workers, {sum(threads)} threads; dashboard: {self._client.dashboard_link}"
+        threads = self.client.nthreads().values()
+        return f"{len(threads)} workers, {sum(threads)} threads; dashboard: {self.client.dashboard_link}"
 
     def processes(self) -> dict[str, int]:
         """The process number of each worker, by its address."""
-        return dict(self._client.run(os.getpid))
+        return dict(self.client.run(os.getpid))
 
     def map(
         self, function: Callable[..., R], pieces: Iterable[tuple[Any, ...]], *common: Any
     ) -> Generator[R, None, None]:
         """See `Workers`."""
         source = iter(pieces)
-        with _one_line():
+        with one_line():
             n = _AHEAD * self._threads()
 
             def begin(n: int) -> Iterator[Future]:
@@ -101,23 +105,23 @@ class Cluster:
                     yield self._result(ahead.popleft())
                     ahead.extend(begin(1))
             finally:
-                self._client.cancel(list(ahead))
+                self.client.cancel(list(ahead))
 
     def hold(self, value: Any) -> Any:
         """Put a value where work is done: with the scheduler, which gives it to the workers that ask."""
         if isinstance(value, Future | FunctionType | int | float | str | None):
             return value
-        with _one_line():
-            return self._client.submit(_itself, value, pure=False)
+        with one_line():
+            return self.client.submit(_itself, value, pure=False)
 
     def fetch(self, held: Sequence[Any]) -> list[Any]:
         """See `Workers`."""
-        with _one_line():
+        with one_line():
             return [self._result(one) for one in held]
 
     def total(self, function: Callable[..., Sums], held: Sequence[tuple[Any, ...]], *common: Any) -> Sums:
         """See `Workers`; sums are added on the workers, and those that can be are added first."""
-        with _one_line():
+        with one_line():
             together = _FAN_IN if len(held) >= _AHEAD * _FAN_IN * self._threads() else 1
             level = [self._part_of_total(function, group, common) for group in _groups(held, together)]
             while len(level) > 1:
@@ -127,11 +131,11 @@ class Cluster:
 
     def each(self, function: Callable[..., R], held: Sequence[tuple[Any, ...]], *common: Any) -> list[Any]:
         """See `Workers`."""
-        with _one_line():
+        with one_line():
             return [self._submit(function, *values, *common) for values in held]
 
     def _threads(self) -> int:
-        threads: int = sum(self._client.nthreads().values())
+        threads: int = sum(self.client.nthreads().values())
         return max(1, threads)
 
     def _result(self, future: Future) -> Any:
@@ -140,7 +144,7 @@ class Cluster:
             try:
                 return future.result(timeout=_PATIENCE_S)
             except TimeoutError:
-                if future.status == "pending" and not self._client.nthreads():
+                if future.status == "pending" and not self.client.nthreads():
                     raise InputError("no worker is left; their logs tell why") from None
 
     def _part_of_total(
@@ -152,125 +156,11 @@ class Cluster:
     def _sum(self, parts: Sequence[Future]) -> Future:
         if len(parts) == 1:
             return parts[0]
-        return self._client.submit(add_sums, *parts, pure=False, priority=1)
-
-    def errands(self, on_told: "Callable[[str, str, dict[str, Any]], None]") -> "Errands":
-        """Work that lasts until somebody ends it; see `Errands`."""
-        return Errands(self._client, self._versions, on_told)
+        return self.client.submit(add_sums, *parts, pure=False, priority=1)
 
     def _submit(self, function: Callable[..., R], *values: Any) -> Future:
         # A piece that cannot be read on one machine may be read on another.
-        return self._client.submit(_worked, self._versions, function, *values, pure=False, retries=2)
-
-
-class UnansweredError(InputError):
-    """A worker did not hear from the scheduler, and ended what nobody had ended."""
-
-
-class Errands:
-    """Functions that run on workers until they are ended; one whose worker dies begins again on another.
-
-    Args:
-        client: connected.
-        versions: of all that decides what comes out.
-        on_told: called from a thread with an errand's name, its worker's address and what it told.
-    """
-
-    def __init__(
-        self,
-        client: Client,
-        versions: dict[str, str],
-        on_told: Callable[[str, str, dict[str, Any]], None],
-    ) -> None:
-        """Hear what errands tell."""
-        self._client, self._versions = client, versions
-        self._id = f"streamfeat-{uuid.uuid4()}"
-        self._futures: dict[str, Future] = {}
-        self._end = Event(self._id, client=client)
-        client.subscribe_topic(self._id, lambda event: on_told(*event[1]))
-
-    def begin(self, name: str, function: Callable[..., Any], *values: Any) -> None:
-        """Run `function(errand, *values)` on some worker, with an `Errand`.
-
-        Args:
-            name: of the errand; one that has begun is not begun again.
-            function: of a module; what it returns is told as the last.
-            values: small.
-        """
-        if name not in self._futures:
-            given = self._versions, self._id, name, function, *values
-            self._futures[name] = self._client.submit(_errand, *given, pure=False)
-
-    def check(self) -> dict[str, str]:
-        """Why errands failed that were not ended, by name.
-
-        Those whose workers all died, or could not reach the scheduler, are begun again.
-        """
-        failed = {name: future for name, future in self._futures.items() if future.status == "error"}
-        found = {}
-        for name, future in failed.items():
-            try:
-                with _one_line():
-                    future.result()
-            except InputError as error:
-                found[name] = str(error)
-                if isinstance(error, UnansweredError) or isinstance(error.__cause__, KilledWorker):
-                    future.retry()
-                else:
-                    del self._futures[name]
-        return found
-
-    def end(self, timeout_s: float = 20.0) -> None:
-        """End all errands, and wait until they have."""
-        with _one_line():
-            self._end.set()
-            with self._client.as_current():
-                wait(list(self._futures.values()), timeout=timeout_s)
-            self._client.unsubscribe_topic(self._id)
-
-
-class Errand:
-    """What a function that runs as an errand is given.
-
-    Args:
-        run_id: of the errands that it is one of.
-        name: its own.
-    """
-
-    def __init__(self, run_id: str, name: str) -> None:
-        """On a worker, in the thread of a task."""
-        self._worker = get_worker()
-        self._key = self._worker.get_current_task()
-        self._id, self._name = run_id, name
-        self._end = Event(run_id, client=get_client())
-        self.is_unanswered = False
-        """It ended because the scheduler did not answer: that may be there again, and take it for done."""
-
-    def is_wanted(self) -> bool:
-        """Whether nobody has ended it: neither whoever began it, nor the scheduler, nor the loss of both."""
-        task = self._worker.state.tasks.get(self._key)
-        if task is None or task.state == "cancelled":
-            return False
-        try:
-            return not self._end.is_set()
-        except (OSError, TimeoutError):
-            self.is_unanswered = True
-            return False
-
-    def tell(self, what: dict[str, Any]) -> None:
-        """Tell whoever began it."""
-        self._worker.log_event(self._id, (self._name, self._worker.address, what))
-
-
-def _errand(
-    versions: dict[str, str], run_id: str, name: str, function: Callable[..., Any], *values: Any
-) -> None:
-    _check(versions, _versions(), get_worker().address)
-    errand = Errand(run_id, name)
-    secede()  # a worker has room for many: they wait most of the time
-    errand.tell(function(errand, *values))
-    if errand.is_unanswered:
-        raise UnansweredError(f"the scheduler did not answer worker {get_worker().address} for a while")
+        return self.client.submit(_worked, self.versions, function, *values, pure=False, retries=2)
 
 
 @contextmanager
@@ -306,7 +196,7 @@ def local(n_workers: int, threads: int | None = None) -> Iterator[Cluster]:
     if n_workers < 1:
         raise InputError(f"{n_workers} workers cannot do anything; give at least one")
     threads = threads or max(1, dask.system.CPU_COUNT // n_workers)
-    with dask.config.set(_SETTINGS), _one_line():
+    with dask.config.set(_SETTINGS), one_line():
         with _ctrl_c_ignored():
             cluster = LocalCluster(
                 n_workers=n_workers,
@@ -333,7 +223,7 @@ def _ctrl_c_ignored() -> Iterator[None]:
 
 
 @functools.cache
-def _versions() -> dict[str, str]:
+def versions_here() -> dict[str, str]:
     """Of all that decides what comes out."""
     return {
         "python": platform.python_version(),
@@ -341,7 +231,17 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _check(wanted: dict[str, str], found: dict[str, Any], address: str) -> None:
+def check_versions(wanted: dict[str, str], found: dict[str, Any], address: str) -> None:
+    """Refuse a worker with other versions.
+
+    Args:
+        wanted: of the client, by name.
+        found: of the worker; None for what it does not have.
+        address: of the worker.
+
+    Raises:
+        InputError: one differs.
+    """
     for name, right in wanted.items():
         there = found.get(name)
         if name == "python":
@@ -365,10 +265,10 @@ def _itself(value: Any) -> Any:
     return value
 
 
-def _worked(versions: dict[str, str], function: Callable[..., R], *values: Any) -> R:
+def _worked(asked: dict[str, str], function: Callable[..., R], *values: Any) -> R:
     """Call a function on a worker; what goes wrong there is told with its address."""
     worker = get_worker().address
-    _check(versions, _versions(), worker)
+    check_versions(asked, versions_here(), worker)
     try:
         with one_blas_thread():
             return function(*values)
@@ -377,7 +277,7 @@ def _worked(versions: dict[str, str], function: Callable[..., R], *values: Any) 
 
 
 @contextmanager
-def _one_line() -> Iterator[None]:
+def one_line() -> Iterator[None]:
     """What can go wrong with a cluster, as one line."""
     try:
         yield

@@ -24,6 +24,7 @@ from live_net import free_port, until
 
 from streamfeat.cluster import connected, local
 from streamfeat.encoder import Encoder
+from streamfeat.errands import Errands
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
 from streamfeat.evaluate.run import evaluate
@@ -171,7 +172,7 @@ def hears_nothing_at_first(errand, mark):
 
 def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(two, tmp_path):
     told, reasons = [], {}
-    errands = two.errands(lambda name, worker, what: told.append((name, what["first"])))
+    errands = Errands(two, lambda name, worker, what: told.append((name, what["first"])))
     errands.begin("a", hears_nothing_at_first, tmp_path / "mark")
     until(lambda: reasons.update(errands.check()) or reasons, "that it failed")
     assert "the scheduler did not answer worker tcp://127.0.0.1:" in reasons["a"]

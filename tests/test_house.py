@@ -44,7 +44,7 @@ LAYERS = [
     {"window", "recorder", "emission"},
     {"encoder", "sinks", "report", "table", "terminal_view"},
     {"cluster", "engine", "classifier", "features", "foreign", "learn"},
-    {"moment"},
+    {"errands", "moment"},
     {"session"},
     {"cameras", "pipeline"},
     {"replay", "live"},
@@ -116,7 +116,7 @@ ONLY_IN = {
     "matplotlib": {"latency.picture"},
     "pyarrow": {"table"},
     "dask": {"cluster"},
-    "distributed": {"cluster"},
+    "distributed": {"cluster", "errands"},
     "foxglove": {"view.channels"},
     "numba": {"kernels.compiled", "kernels.lasso", "latency.stopwatch", "doctor"},
 }

@@ -15,7 +15,8 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
-from streamfeat.cluster import Cluster, Errand
+from streamfeat.cluster import Cluster
+from streamfeat.errands import Errand, Errands
 from streamfeat.live.listen import Listen
 from streamfeat.live.names import Names
 from streamfeat.live.network import TopicWatch, open_session
@@ -146,7 +147,7 @@ class Spread:
         Raises:
             InputError: the network or the cluster cannot be used.
         """
-        errands = self._cluster.errands(self._on_told)
+        errands = Errands(self._cluster, self._on_told)
 
         def serve(topic: str) -> None:
             with self._lock:
