@@ -13,6 +13,7 @@ import itertools
 import os
 import platform
 import signal
+import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -159,8 +160,10 @@ class Cluster:
         return self.client.submit(add_sums, *parts, pure=False, priority=1)
 
     def _submit(self, function: Callable[..., R], *values: Any) -> Future:
+        # The dashboard groups by what is before the number.
+        key = f"{function.__name__.strip('_')}-{uuid.uuid4()}"
         # A piece that cannot be read on one machine may be read on another.
-        return self.client.submit(_worked, self.versions, function, *values, pure=False, retries=2)
+        return self.client.submit(_worked, self.versions, function, *values, key=key, retries=2)
 
 
 @contextmanager

@@ -23,7 +23,17 @@ from typing import Any, BinaryIO, cast
 
 from streamfeat.errors import InputError
 
-__all__ = ["Location", "Place", "fetched", "files_below", "is_folder", "open_binary", "place_of", "size_of"]
+__all__ = [
+    "Location",
+    "Place",
+    "absolute",
+    "fetched",
+    "files_below",
+    "is_folder",
+    "open_binary",
+    "place_of",
+    "size_of",
+]
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::[A-Za-z][A-Za-z0-9+.-]*)*://")
 _USER = re.compile(r"(?<=://)[^/\s'\"]*@")
@@ -80,6 +90,11 @@ def place_of(text: "str | PathLike[str] | Location") -> Place:
     if isinstance(text, str) and _URL.match(text):
         return Location(text)
     return Path(text)
+
+
+def absolute(place: Place) -> Place:
+    """The same place, whatever folder somebody works in."""
+    return place.absolute() if isinstance(place, Path) else place
 
 
 def open_binary(place: Place) -> BinaryIO:

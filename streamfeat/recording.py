@@ -33,7 +33,7 @@ from streamfeat.mcap_records import (
 )
 from streamfeat.messages import LabelMessage
 from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
-from streamfeat.places import Location, Place, place_of
+from streamfeat.places import Location, Place, absolute, place_of
 from streamfeat.samples import Sample, complete_samples
 
 __all__ = [
@@ -196,8 +196,8 @@ class Recording:
         return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
-        """What opens some of this recording, and can be pickled."""
-        return partial(Recording, self.path, self.topic, part)
+        """What opens some of this recording, wherever that is called, and can be pickled."""
+        return partial(Recording, absolute(self.path), self.topic, part)
 
     def items(self) -> Iterator[Packet | Label]:
         """Yield packets and labels in stored order; a label comes before its first packet."""

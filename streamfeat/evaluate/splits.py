@@ -15,7 +15,7 @@ import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
 from streamfeat.errors import InputError
-from streamfeat.places import Place
+from streamfeat.places import Place, absolute
 from streamfeat.recording import HELD_OUT_SPLITS, WHOLE, Label, Packet, Part, Recording, open_recording
 
 __all__ = ["DataSet", "Fold"]
@@ -40,7 +40,7 @@ class Fold(Recording):
 
     def part(self, part: Part) -> Callable[[], Recording]:
         """See `Recording`."""
-        return partial(Fold, self.path, self.topic, self._held_out, part)
+        return partial(Fold, absolute(self.path), self.topic, self._held_out, part)
 
     def placed_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
         """As those of the recording, with other splits, and without a held-out label and its events."""
