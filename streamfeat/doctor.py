@@ -27,9 +27,11 @@ from streamfeat.simulate import CameraModel, digit_samples
 __all__ = ["EXTRAS", "examine"]
 
 EXTRAS = {
+    "cluster": "work on other processes and machines",
     "convert": "Prophesee HDF5 files",
     "export": "Arrow, Parquet and pandas",
     "plot": "pages and pictures of results",
+    "store": "recordings by URL",
     "view": "Foxglove",
     "bench": "peers in tools/bench",
     "fuzz": "guided inputs in tools/torture",
