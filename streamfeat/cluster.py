@@ -51,6 +51,9 @@ _PACKAGES = ("streamfeat", "numpy", "numba")
 _SETTINGS = {
     "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
     "distributed.admin.large-graph-warning-threshold": "1GB",
+    # Dask has workers give memory back at once; arrays of megabytes then come from the system, page by page.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
 
 
