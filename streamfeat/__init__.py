@@ -7,18 +7,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from streamfeat.classifier import Classifier, OnlineClassifier
-    from streamfeat.conventions import as_events
-    from streamfeat.encoder import Encoder
-    from streamfeat.engine import Engine
+    from streamfeat.classify.classifier import Classifier, OnlineClassifier
+    from streamfeat.classify.features import EventFeatures
+    from streamfeat.engine.encoder import Encoder
+    from streamfeat.engine.engine import Engine
+    from streamfeat.engine.geometry import Geometry
     from streamfeat.errors import InputError
-    from streamfeat.events import EVENT_DTYPE, make_events
-    from streamfeat.features import EventFeatures
-    from streamfeat.geometry import Geometry
+    from streamfeat.events import EVENT_DTYPE, as_events, make_events
     from streamfeat.learn.dictionary import DictionaryLearner
     from streamfeat.learn.transform import TransformLearner
-    from streamfeat.recorder import RecordingWriter
-    from streamfeat.recording import open_recording
+    from streamfeat.recordings.reader import open_recording
+    from streamfeat.recordings.writer import RecordingWriter
 
 __all__ = [
     "EVENT_DTYPE",
@@ -39,19 +38,19 @@ __all__ = [
 
 _HOMES = {
     "EVENT_DTYPE": "events",
-    "Classifier": "classifier",
+    "Classifier": "classify.classifier",
     "DictionaryLearner": "learn.dictionary",
-    "Encoder": "encoder",
-    "Engine": "engine",
-    "EventFeatures": "features",
-    "Geometry": "geometry",
+    "Encoder": "engine.encoder",
+    "Engine": "engine.engine",
+    "EventFeatures": "classify.features",
+    "Geometry": "engine.geometry",
     "InputError": "errors",
-    "OnlineClassifier": "classifier",
-    "RecordingWriter": "recorder",
+    "OnlineClassifier": "classify.classifier",
+    "RecordingWriter": "recordings.writer",
     "TransformLearner": "learn.transform",
-    "as_events": "conventions",
+    "as_events": "events",
     "make_events": "events",
-    "open_recording": "recording",
+    "open_recording": "recordings.reader",
 }
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat import codecs
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE
+from streamfeat.messages import codecs
 
 SIZE = struct.Struct("<I")
 
@@ -33,7 +33,7 @@ def unpack(data):
 def decoded(data):
     """A line for each payload and encoding with state from packet to packet."""
     lines = []
-    for encoding in codecs.ENCODINGS:
+    for encoding in codecs.PAYLOAD_ENCODINGS:
         decoder = codecs.make_decoder(encoding)
         for payload in unpack(data):
             try:

@@ -11,9 +11,10 @@ import naive
 import numpy as np
 from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random_events
 
-from streamfeat.engine import Engine
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.operator import n_features
 from streamfeat.events import EVENT_DTYPE
-from streamfeat.geometry import Geometry
 from streamfeat.kernels import (
     change,
     code,
@@ -41,7 +42,6 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
-from streamfeat.operator import n_features
 
 SCRATCH = {
     "touched",

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import zenoh
 
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 
 PATIENCE_S = float(os.environ.get("LIVE_PATIENCE_S", "120"))
@@ -85,7 +85,7 @@ def attachment(seq, gid=b"0123456789abcdef", source_ns=0):
 def compiled(folder):
     """Compile what listening needs, before anybody waits for anything; processes find it in numba's cache."""
     for emit in ("event", "10ms"):
-        Listen(PlainNames("x"), folder / "model", emit=emit)._warm_up()
+        ListenJob(PlainNames("x"), folder / "model", emit=emit)._warm_up()
     return folder
 
 

@@ -7,10 +7,10 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
-from streamfeat.geometry import Geometry
 
 KINDS = [(f, e) for f in ("direct", "inverse") for e in ("soft", "split", "triangle")]
 """Every formulation with every encoding."""

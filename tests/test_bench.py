@@ -10,7 +10,7 @@ import pytest
 from streams import random_encoder
 
 import streamfeat as sf
-from streamfeat.operator import with_fixed_point
+from streamfeat.engine.operator import with_fixed_point
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT))

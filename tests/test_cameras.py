@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import tiny
 
-from streamfeat.cameras import Cameras, Gone
-from streamfeat.emission import EmitPolicy
-from streamfeat.packets import Tick
-from streamfeat.session import Session
+from streamfeat.messages.packets import Watermark
+from streamfeat.stream.cameras import CameraLeft, Cameras
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)
@@ -49,10 +49,10 @@ def test_who_leaves_is_read_once_more_and_forgotten():
     cameras = Cameras(make_session)
     run([replace(tiny.packet(tiny.steady(0, 5_000, 50)), topic="a")], cameras)
     assert cameras.topics == ["a"]
-    (last,) = run([Gone("a")], cameras)
+    (last,) = run([CameraLeft("a")], cameras)
     assert (last.topic, last.n_events) == ("a", 50)
     assert cameras.topics == []
-    assert run([Gone("a"), Tick("a", 10**9)], cameras) == []
+    assert run([CameraLeft("a"), Watermark("a", 10**9)], cameras) == []
     run([replace(tiny.packet(tiny.steady(0, 5_000, 50)), topic="a")], cameras)
     assert (cameras.seen, cameras.stats().events) == (2, 100)
 
@@ -65,7 +65,7 @@ def test_more_cameras_than_there_is_room_for():
     assert cameras.topics == ["a", "b", "c"]
     assert [topic for topic, *_ in told] == ["d", "e"]
     assert cameras.refused == {"too many cameras": 2}
-    run([Gone("b"), packets[3]], cameras)
+    run([CameraLeft("b"), packets[3]], cameras)
     assert cameras.topics == ["a", "c", "d"]
 
 

@@ -17,16 +17,16 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import LinearSVC
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from streamfeat import svm as svm_module
-from streamfeat.classifier import (
+from streamfeat.classify import svm as svm_module
+from streamfeat.classify.classifier import (
     Classifier,
     OnlineClassifier,
     _climb,
     normalise_features,
     train_classifier,
 )
+from streamfeat.classify.svm import LinearSVM
 from streamfeat.errors import InputError
-from streamfeat.svm import LinearSVM
 
 # --- the support vector machine
 

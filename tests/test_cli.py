@@ -18,14 +18,14 @@ from safetensors.numpy import save_file
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.classifier import Classifier
-from streamfeat.encoder import Encoder
+from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.features import sample_end
+from streamfeat.engine.encoder import Encoder
 from streamfeat.events import make_events
-from streamfeat.features import sample_end
 from streamfeat.learn import alternation, volumes
-from streamfeat.messages import EventPacket
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, open_recording
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.recordings.reader import Label, open_recording
+from streamfeat.recordings.writer import RecordingWriter
 
 LEARN = ["--filters", "6", "--patch", "6", "--stride", "7", "--bins", "2", "--volumes", "300"]
 LEARN += ["--iterations", "2"]
@@ -469,7 +469,7 @@ def test_too_little_memory_is_one_line(run, home, tmp_path, monkeypatch):
     def load(path):
         raise MemoryError("Unable to allocate 8.00 PiB")
 
-    monkeypatch.setattr("streamfeat.encoder.Encoder.load", load)
+    monkeypatch.setattr("streamfeat.engine.encoder.Encoder.load", load)
     result = run("train", home / "train.mcap", "-m", home / "direct", "-o", tmp_path / "clf")
     assert (result.status, result.err) == (
         2,

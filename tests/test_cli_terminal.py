@@ -13,7 +13,7 @@ import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.recording import open_recording
+from streamfeat.recordings.reader import open_recording
 
 ESCAPE = re.compile(r"\x1b\[([0-9;]*)m")
 COMMAND = [
@@ -223,10 +223,10 @@ def test_one_file_that_cannot_be_read_leaves_no_recording(tmp_path):
 
 
 def test_predicting_does_not_wait_for_scikit_learn():
-    code = "import sys, streamfeat.replay, streamfeat.live.listen; print(*sys.modules)"
+    code = "import sys, streamfeat.stream.replay, streamfeat.live.listen; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     loaded = set(done.stdout.split())
-    assert "streamfeat.classifier" in loaded
+    assert "streamfeat.classify.classifier" in loaded
     assert not loaded & {"sklearn", "pandas", "bokeh", "pyarrow", "foxglove"}

@@ -22,19 +22,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_net import free_port, until
 
-from streamfeat.cluster import connected, local
-from streamfeat.encoder import Encoder
-from streamfeat.errands import Errands
+from streamfeat.classify.features import encode_recordings
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
 from streamfeat.evaluate.run import evaluate
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.features import encode_recordings
 from streamfeat.foreign import datasets
 from streamfeat.learn.fit import learn_encoder
-from streamfeat.learn.setting import Setting
-from streamfeat.recording import open_recording
-from streamfeat.workers import Here, add_sums
+from streamfeat.learn.settings import Setting
+from streamfeat.recordings.reader import open_recording
+from streamfeat.work.cluster import connected, local
+from streamfeat.work.services import Services
+from streamfeat.work.workers import ThreadWorkers, add_sums
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 TRAIN = RECORDINGS / "digits_train.mcap"
@@ -63,7 +63,7 @@ def learned(workers, formulation="direct", report=lambda *step: None):
 
 @functools.cache
 def learned_here(formulation):
-    return learned(Here(1), formulation)
+    return learned(ThreadWorkers(1), formulation)
 
 
 # --- sums
@@ -75,7 +75,9 @@ def test_sums_are_added_as_one_tree(values, threads):
     tree = parts
     while len(tree) > 1:
         tree = [add_sums(*tree[i : i + 2]) for i in range(0, len(tree), 2)]
-    (found,) = Here(threads).total(lambda value: (np.array([value]),), [(value,) for value in values])
+    (found,) = ThreadWorkers(threads).total(
+        lambda value: (np.array([value]),), [(value,) for value in values]
+    )
     assert found[0] == tree[0][0][0]
     assert found[0] == pytest.approx(sum(values), abs=1e-6)
 
@@ -84,7 +86,7 @@ def test_sums_are_added_as_one_tree(values, threads):
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40))
 def test_sums_of_a_cluster_are_the_same_tree(two, values):
     held = [(two.hold(np.array([value])),) for value in values]
-    here = Here(1).total(alone, [(np.array([value]),) for value in values])
+    here = ThreadWorkers(1).total(alone, [(np.array([value]),) for value in values])
     assert two.total(alone, held)[0].tolist() == here[0].tolist()
 
 
@@ -98,7 +100,7 @@ def alone(value):
 @pytest.mark.parametrize("formulation", ["direct", "inverse"])
 def test_what_is_learned_has_the_same_bits(two, formulation):
     expected = learned_here(formulation)
-    assert learned(Here(3), formulation) == expected
+    assert learned(ThreadWorkers(3), formulation) == expected
     assert learned(two, formulation) == expected
 
 
@@ -121,7 +123,7 @@ def evaluated(animals, workers, finished=lambda row: None):
 
 
 def test_an_evaluation_is_the_same(two, animals):
-    assert evaluated(animals, two) == evaluated(animals, Here(1))
+    assert evaluated(animals, two) == evaluated(animals, ThreadWorkers(1))
 
 
 def test_a_conversion_is_the_same(two, tmp_path):
@@ -153,7 +155,7 @@ def test_a_worker_that_dies_while_learning_changes_nothing(two):
 
 
 def test_a_worker_that_dies_while_evaluating_changes_nothing(two, animals):
-    expected = evaluated(animals, Here(1))
+    expected = evaluated(animals, ThreadWorkers(1))
     before = [*two.processes().values()]
     alive = len(before)
     found = evaluated(animals, two, lambda row: before and os.kill(before.pop(), signal.SIGKILL))
@@ -161,24 +163,24 @@ def test_a_worker_that_dies_while_evaluating_changes_nothing(two, animals):
     assert len(before) < alive
 
 
-def hears_nothing_at_first(errand, mark):
+def hears_nothing_at_first(service, mark):
     first = not mark.exists()
     mark.touch()
-    errand.is_unanswered = first
-    while not first and errand.is_wanted():
+    service.is_unanswered = first
+    while not first and service.is_wanted():
         time.sleep(0.05)
     return {"first": first}
 
 
 def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(two, tmp_path):
     told, reasons = [], {}
-    errands = Errands(two, lambda name, worker, what: told.append((name, what["first"])))
-    errands.begin("a", hears_nothing_at_first, tmp_path / "mark")
-    until(lambda: reasons.update(errands.check()) or reasons, "that it failed")
+    services = Services(two, lambda name, worker, what: told.append((name, what["first"])))
+    services.begin("a", hears_nothing_at_first, tmp_path / "mark")
+    until(lambda: reasons.update(services.check()) or reasons, "that it failed")
     assert "the scheduler did not answer worker tcp://127.0.0.1:" in reasons["a"]
-    until(lambda: errands._futures["a"].status == "pending", "its second beginning")
-    assert errands.check() == {}
-    errands.end()
+    until(lambda: services._futures["a"].status == "pending", "its second beginning")
+    assert services.check() == {}
+    services.end()
     until(lambda: told == [("a", True), ("a", False)], lambda: f"{told}")
 
 
@@ -186,7 +188,7 @@ def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("streamfeat.cluster._PATIENCE_S", 0.5)
+    monkeypatch.setattr("streamfeat.work.cluster._PATIENCE_S", 0.5)
     address = f"tcp://127.0.0.1:{free_port()}"
     result = run("learn", TRAIN, "-o", tmp_path / "model", "--cluster", address)
     assert (result.status, result.err.count("\n")) == (2, 1)
@@ -248,7 +250,7 @@ def test_workers_of_another_version_are_refused(tmp_path):
     [("scheduler", "a worker or the scheduler lacks a package: "), ("worker", "no worker is left")],
 )
 def test_one_without_the_package_is_one_line(tmp_path, lacking, reason, monkeypatch):
-    monkeypatch.setattr("streamfeat.cluster._PATIENCE_S", 5.0)  # Dask ends a worker that cannot unpickle
+    monkeypatch.setattr("streamfeat.work.cluster._PATIENCE_S", 5.0)  # Dask ends a worker that cannot unpickle
     (tmp_path / "streamfeat.py").write_text("'''Not the package.'''\n")
     folders = (tmp_path, RECORDINGS) if lacking == "scheduler" else (RECORDINGS, tmp_path)
     with (

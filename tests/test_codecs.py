@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.codecs import ENCODINGS, Evt3Decoder, LibcaerCmpDecoder, encode, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, make_events
 from streamfeat.kernels import decode as kernels
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, Evt3Decoder, LibcaerCmpDecoder, encode, make_decoder
 
 WORDS = arrays(np.uint16, st.integers(0, 60), elements=st.integers(0, 0xFFFF))
 
@@ -187,7 +187,7 @@ def test_evt3_round_trip_over_packets_and_silence():
     np.testing.assert_array_equal(np.concatenate(back), events)
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", PAYLOAD_ENCODINGS)
 def test_empty_payload(encoding):
     assert encode(np.zeros(0, EVENT_DTYPE), encoding) == (b"", 0)
     assert len(decode(encoding, b"")) == 0
@@ -263,7 +263,7 @@ def test_evt3_refuses_to_go_back_between_packets():
         encode(make_events([1], [1], [1], [5]), "evt3", after_us=6)
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", PAYLOAD_ENCODINGS)
 @settings(deadline=None, max_examples=60)
 @given(payload=st.binary(max_size=200), time_base_ns=st.integers(0, 2**64 - 1))
 def test_any_bytes_decode_or_are_refused(encoding, payload, time_base_ns):

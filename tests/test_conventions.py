@@ -8,7 +8,7 @@ import tiny
 
 import streamfeat as sf
 from streamfeat.events import EVENT_DTYPE
-from streamfeat.recording import open_recording
+from streamfeat.recordings.reader import open_recording
 
 LAYOUTS = {
     "metavision": [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")],

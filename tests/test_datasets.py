@@ -12,7 +12,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
 from streamfeat.foreign.datasets import SamplePath, convert, find_samples
 from streamfeat.foreign.event_files import read_events
-from streamfeat.recording import Label, Sample, open_recording
+from streamfeat.recordings.reader import Label, Sample, open_recording
 
 NCARS_HEADER = b"% Data file containing N9Chronocam7Event2dE events.\n% Version 2\n\x00\x08"
 

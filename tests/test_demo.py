@@ -8,8 +8,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from streamfeat import cli, demo
-from streamfeat.recording import open_recording
+from streamfeat import cli
+from streamfeat.demo import demo
+from streamfeat.recordings.reader import open_recording
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,8 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from streamfeat import cli, doctor
+from streamfeat import cli
+from streamfeat.cli import installation as doctor
 
 REAL = doctor.requires("streamfeat")
 

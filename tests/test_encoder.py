@@ -10,14 +10,14 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from streams import KINDS, LASSO_KINDS, random_encoder, random_events
 
-from streamfeat import safe_arrays
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.operator import with_fixed_point
 from streamfeat.errors import InputError
-from streamfeat.files import replacing, write_atomically
-from streamfeat.geometry import Geometry
+from streamfeat.files import safetensors_file as safe_arrays
+from streamfeat.files.atomic import replacing, write_atomically
 from streamfeat.kernels.layout import TRIANGLE
-from streamfeat.operator import with_fixed_point
 
 ids = "-".join
 
@@ -512,7 +512,7 @@ def test_a_failed_save_leaves_the_earlier_model(saved, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("streamfeat.files.os.fsync", full)
+    monkeypatch.setattr("streamfeat.files.atomic.os.fsync", full)
     with pytest.raises(InputError, match="No space left"):
         known_encoder(("direct", "split")).save(saved)
     assert saved.read_bytes() == before

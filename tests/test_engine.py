@@ -9,11 +9,11 @@ import pytest
 from kernel_table import assert_certified
 from streams import EXACT_KINDS, KINDS, LASSO_KINDS, Case, random_events
 
-from streamfeat import engine as engine_module
-from streamfeat.engine import Engine, EngineStats
+from streamfeat.engine import engine as engine_module
+from streamfeat.engine.engine import Engine, EngineStats
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, make_events
-from streamfeat.geometry import Geometry
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import count_events
 from streamfeat.kernels.layout import CLOCK_PLANE, CURSOR_CODED, CURSOR_ENTRY, CURSOR_PROJECTED

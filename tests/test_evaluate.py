@@ -18,7 +18,7 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
@@ -31,8 +31,8 @@ from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHi
 from streamfeat.events import make_events
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.volumes import windows_of
-from streamfeat.machine import PeakMemory
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
+from streamfeat.report.machine import PeakMemory
 
 QUICK = ["--patch", "4", "--bins", "2", "--filters", "12", "--volumes", "600", "--iterations", "2"]
 BASELINES = [

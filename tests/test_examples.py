@@ -14,8 +14,8 @@ import tiny
 from live_net import PATIENCE_S, free_port, plain_publisher, plain_session
 
 import streamfeat as sf
-from streamfeat.packets import PacketWriter
-from streamfeat.replay import Replay
+from streamfeat.messages.packets import PacketWriter
+from streamfeat.stream.replay import ReplayJob
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "tools" / "examples"
@@ -86,7 +86,7 @@ def test_training_on_a_folder(tmp_path, capsys):
 
 def test_reading_with_plain_mcap(monkeypatch, tmp_path, capsys):
     needs("mcap_ros2", "extra test")
-    job = Replay(
+    job = ReplayJob(
         RECORDINGS / "digits_test.mcap",
         RECORDINGS / "digits.safetensors",
         RECORDINGS / "digits_classifier.safetensors",

@@ -13,11 +13,11 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.utils.validation import check_is_fitted
 
 import streamfeat as sf
-from streamfeat.classifier import normalise_features
+from streamfeat.classify.classifier import normalise_features
+from streamfeat.classify.features import encode_recordings, mirrored, training_set
+from streamfeat.classify.svm import LinearSVM
 from streamfeat.errors import InputError
-from streamfeat.features import encode_recordings, mirrored, training_set
-from streamfeat.recording import Label, Sample, open_recording
-from streamfeat.svm import LinearSVM
+from streamfeat.recordings.reader import Label, Sample, open_recording
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 import tiny
 
-from streamfeat.replay import Replay
+from streamfeat.stream.replay import ReplayJob
 
 resource = pytest.importorskip("resource", reason="this system has no limits for files")
 
@@ -48,7 +48,7 @@ def test_no_room(tmp_path):
     tiny.classifier(model).save(tmp_path / "classifier")
     tiny.write_items(tmp_path / "samples.mcap", tiny.labelled_items(6))
     # What is compiled is in the cache then, which cannot be added to where there is no room.
-    Replay(tmp_path / "samples.mcap", tmp_path / "model", tmp_path / "classifier", emit="1ms").run()
+    ReplayJob(tmp_path / "samples.mcap", tmp_path / "model", tmp_path / "classifier", emit="1ms").run()
     common = ["samples.mcap", "-m", "model", "-c", "classifier", "--emit", "1ms"]
     possible = {
         name: [command, *common, option, f"out/{name}"]

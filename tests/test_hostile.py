@@ -23,14 +23,14 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from safetensors.numpy import save
 
-from streamfeat.codecs import ENCODINGS
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE
 from streamfeat.foreign.event_files import read_events
-from streamfeat.geometry import Geometry
-from streamfeat.recorder import RecordingWriter, recover
-from streamfeat.recording import Label, open_recording
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS
+from streamfeat.recordings.reader import Label, open_recording
+from streamfeat.recordings.writer import RecordingWriter, recover
 from tools.torture.fuzz import Watch, all_targets, random_inputs
 from tools.torture.mutate import mend_mcap, mend_zip
 
@@ -80,7 +80,7 @@ def test_payloads_within_bounds_and_uncompiled_give_the_same(mode, tmp_path):
     """`python tools/torture --only bytes` does it with the kernels of engines, too."""
     payloads = [
         data[3:][: len(data) // 2 * 2 - 4]
-        for encoding in ENCODINGS
+        for encoding in PAYLOAD_ENCODINGS
         for data in random_inputs(TARGETS[f"payload {encoding}"], 60, seed=3)
     ]
     (tmp_path / "payloads").write_bytes(decode_hostile.pack(payloads))

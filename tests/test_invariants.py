@@ -23,12 +23,12 @@ from streams import (
     streams,
 )
 
-from streamfeat.engine import Engine
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
 from streamfeat.foreign.event_files import open_events
-from streamfeat.geometry import Geometry
 from streamfeat.kernels.layout import CLOCK_PLANE, CLOCK_TOUCHED
-from streamfeat.recording import open_recording
+from streamfeat.recordings.reader import open_recording
 
 EXAMPLES = 25
 ids = "-".join

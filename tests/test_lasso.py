@@ -7,9 +7,9 @@ import pytest
 from kernel_table import assert_certified, lasso_scratch, with_response
 from streams import GAP, random_encoder, random_events
 
-from streamfeat.engine import Engine
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
-from streamfeat.geometry import Geometry
 from streamfeat.kernels.lasso import CODE, RESPONSE, solve_lasso
 
 

@@ -17,22 +17,22 @@ from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.latency.end_to_end import measure_end_to_end, without_silence
 from streamfeat.latency.histogram import PERCENTILES, Latencies
-from streamfeat.latency.hop import hop, without_silence
 from streamfeat.latency.measure import LatencyReport
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
+from streamfeat.latency.text import spell
 from streamfeat.latency.update import call_each, feed_and_read, walk
-from streamfeat.latency.words import spell
-from streamfeat.machine import Disturbance, describe_machine
-from streamfeat.messages import EventPacket
-from streamfeat.recording import Label, Packet, open_recording
-from streamfeat.report import Section, Table, write_report
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.recordings.reader import Label, Packet, open_recording
+from streamfeat.report.machine import Disturbance, describe_machine
+from streamfeat.report.pages import Section, Table, write_report
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 DIGITS, DIGITS_MODEL = RECORDINGS / "digits_test.mcap", RECORDINGS / "digits.safetensors"
@@ -211,13 +211,15 @@ def test_the_clock_has_a_cost():
     assert 1 < python_clock_cost_ns() < 100_000
 
 
-# --- the whole hop
+# --- end to end
 
 
 @pytest.mark.parametrize("emit", ["event", "20ms", "100ev", "auto"])
 def test_a_hop_counts_each_emission_once(emit):
     items = tiny.labelled_items(3)
-    took = hop(MODEL, items, EmitPolicy.parse(emit), speed=20.0, look_ahead=True, warm_up=items[:2])
+    took = measure_end_to_end(
+        MODEL, items, EmitPolicy.parse(emit), speed=20.0, look_ahead=True, warm_up=items[:2]
+    )
     session = Session(MODEL, EmitPolicy.parse(emit))
     # Nothing comes after the last sample to end it, so its final reading is not part of the stream.
     expected = sum(
@@ -235,7 +237,7 @@ def test_a_hop_says_how_far_it_falls_behind():
     # One second of the stream in a millisecond: everything is due at once, and the last reading waits
     # for all others.
     items = [tiny.packet(tiny.steady(0, 1_000_000, 20_000))]
-    took = hop(MODEL, items, EmitPolicy.parse("event"), speed=1000.0, look_ahead=True)
+    took = measure_end_to_end(MODEL, items, EmitPolicy.parse("event"), speed=1000.0, look_ahead=True)
     assert len(took) == 20_000
     assert took[-1000:].mean() > 2 * took[:1000].mean()
 
@@ -248,7 +250,7 @@ def test_a_hop_that_is_stopped_leaves_out_what_was_not_due():
         return len(asked) < 4
 
     items = [tiny.packet(tiny.steady(start, start + 1_000, 10)) for start in range(0, 60_000_000, 100_000)]
-    took = hop(MODEL, items, EmitPolicy.parse("event"), speed=1.0, look_ahead=True, goes=goes)
+    took = measure_end_to_end(MODEL, items, EmitPolicy.parse("event"), speed=1.0, look_ahead=True, goes=goes)
     assert 10 <= len(took) < 100
     assert (took > 0).all()
 
@@ -360,12 +362,12 @@ def test_a_row_for_each_model_policy_and_part(run, home):
     emits = ["--emit", "event", "--emit", "10ms", "--emit", "auto"]
     status, out, _ = run(home / "digits.mcap", *models, *emits, *QUICK, "--json")
     said = json.loads(out)
-    parts = {"event": ["update", "bin boundary", "from Python", "whole hop"]}
+    parts = {"event": ["update", "bin boundary", "from Python", "end to end"]}
     expected = [
         (model, emit, what)
         for model in ("direct", "inverse")
         for emit in ("event", "10ms", "auto")
-        for what in parts.get(emit, ["ingest", "reading", "whole hop"])
+        for what in parts.get(emit, ["ingest", "reading", "end to end"])
     ]
     assert [(row["model"], row["emit"], row["what"]) for row in said["rows"]] == expected
     assert (status, said["interrupted"], said["warm_up_events"]) == (0, False, 500)
@@ -471,8 +473,8 @@ def test_an_interrupted_measurement_shows_what_it_has(home):
     code = "from streamfeat.cli import main; main()"
     arguments = ["latency", home / "digits.mcap", "-m", home / "direct.safetensors", "--warm-up", "100"]
     arguments += ["--emit", "10ms", "--emit", "event", "--seconds", "300", "--speed", "0.01", "--json"]
-    notice = "import streamfeat.latency.measure as m; hop = m.hop\n"
-    notice += "m.hop = lambda *a, **k: (print('hop', flush=True), hop(*a, **k))[1]\n"
+    notice = "import streamfeat.latency.measure as m; inner = m.measure_end_to_end\n"
+    notice += "m.measure_end_to_end = lambda *a, **k: (print('hop', flush=True), inner(*a, **k))[1]\n"
     with subprocess.Popen(
         [sys.executable, "-c", notice + code, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -525,7 +527,7 @@ def test_a_page_needs_nothing_else(report, tmp_path):
     assert len(page) < 5_000_000
     assert page.count("<h2>") == 3
     assert "direct, event, update" in page
-    assert "inverse, 10ms, whole hop" in page
+    assert "inverse, 10ms, end to end" in page
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', page)
     assert page.count("Bokeh = factory()") <= 1
     assert list(tmp_path.iterdir()) == [path]

@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
-from streamfeat.geometry import Geometry
 from streamfeat.learn.fit import geometry_of, learn_encoder
-from streamfeat.learn.setting import DEFAULTS, PRESETS, THRESHOLDS, Setting, preset_with
+from streamfeat.learn.settings import DEFAULTS, PRESETS, THRESHOLDS, Setting, preset_with
 from streamfeat.learn.volumes import Volumes, Window, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
-from streamfeat.recording import Label, open_recording
+from streamfeat.recordings.reader import Label, open_recording
 
 D = 12
 

@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from streamfeat.live.clock import CameraClock
-from streamfeat.live.delivery import Delivery, DeliveryStats, Verdict
+from streamfeat.messages.clock import CameraClock
+from streamfeat.messages.delivery import Delivery, DeliveryStats, Verdict
 
 ONE, TWO = b"1" * 16, b"2" * 16
 SECOND = 1_000_000_000

@@ -24,7 +24,7 @@ from test_live_listen import MODEL, batches, listener, message, replayed
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.messages import EventPacket
+from streamfeat.messages.cdr import EventPacket
 
 KEY = "cam/a/events"
 

@@ -3,8 +3,8 @@
 import threading
 import time
 
-from streamfeat.cameras import Gone
 from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.stream.cameras import CameraLeft
 
 SECOND = 1_000_000_000
 
@@ -32,18 +32,18 @@ def test_full_of_bytes_it_drops_the_oldest_and_tells_the_next_of_the_topic():
     inbox = Inbox(max_bytes=10 * 1512)
     for i in range(30):
         inbox.put(raw("ab"[i % 2], number=i))
-    inbox.put(Gone("c"))
+    inbox.put(CameraLeft("c"))
     inbox.put(raw("a", number=30))
     taken = inbox.take(0)
     assert numbers(taken) == list(range(21, 31))
-    assert taken[-2] == Gone("c")
+    assert taken[-2] == CameraLeft("c")
     assert [m.dropped for m in taken[:3]] == [10, 11, 0]
     assert inbox.dropped == 21
     # Who leaves is told of, however full it is.
-    inbox.put(Gone("a"))
+    inbox.put(CameraLeft("a"))
     for i in range(20):
         inbox.put(raw("b", number=i))
-    assert inbox.take(0)[0] == Gone("a")
+    assert inbox.take(0)[0] == CameraLeft("a")
 
 
 def test_what_has_waited_too_long_is_dropped():

@@ -26,18 +26,18 @@ from live_net import (
 )
 from rich.console import Console
 
-from streamfeat.codecs import encode
-from streamfeat.emission import EmitPolicy
 from streamfeat.errors import InputError
 from streamfeat.live import intake
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.live.publish import Publish
-from streamfeat.live.record import Record
+from streamfeat.live.publish import PublishJob
+from streamfeat.live.record import RecordJob
 from streamfeat.live.screen import HealthTable
-from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.recording import open_recording
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.codecs import encode
+from streamfeat.recordings.reader import open_recording
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)
@@ -57,7 +57,7 @@ def files(tmp_path_factory):
 def listener(files, expression="cam/*/events", classifier=True, **options):
     options = {"silence_s": NEVER, "patience_s": NEVER, "max_delay_s": NEVER, "port": free_port()} | options
     chosen = files / "classifier" if classifier else None
-    return Listen(PlainNames(expression), files / "model", chosen, **options)
+    return ListenJob(PlainNames(expression), files / "model", chosen, **options)
 
 
 def message(batch, seq=0, resolution=tiny.RESOLUTION, as_="mono", **changes):
@@ -97,7 +97,7 @@ def same(emissions, expected):
 def test_features_over_zenoh_are_those_of_a_replay_of_the_recording_made_meanwhile(files, tmp_path):
     port, sent = free_port(), batches(60)
     job = listener(files, emit="10ms", port=port)
-    recorder = Record(PlainNames("cam/*/events"), tmp_path / "meanwhile.mcap", port=port)
+    recorder = RecordJob(PlainNames("cam/*/events"), tmp_path / "meanwhile.mcap", port=port)
     with plain_session(port, listen=True) as net, running(job), running(recorder):
         features = Collector(net, "cam/a/features")
         predictions = Collector(net, "cam/a/prediction")
@@ -171,7 +171,7 @@ def test_published_recordings_arrive_whole_and_labelled(files, tmp_path):
     recording = tiny.write_items(tmp_path / "labelled.mcap", items)
     job = listener(files, emit="1000ev", port=port, learn_online=True)
     keys = ["cam/a/events", "cam/b/events"]
-    publishing = Publish(
+    publishing = PublishJob(
         [(recording, key) for key in keys], PlainNames(keys[0]), speed=None, port=port, wait_s=30
     )
     with running(job, more=sink):
@@ -476,7 +476,7 @@ def test_reliable_late_joiners_get_history_and_nothing_is_missed(files, tmp_path
     job = listener(files, emit="1000ev", port=port, classifier=False, reliable=True)
     from streamfeat.live.network import open_session
     from streamfeat.live.publisher import CameraSink
-    from streamfeat.packets import PacketWriter
+    from streamfeat.messages.packets import PacketWriter
 
     writer = PacketWriter()
     with open_session(port=port) as net, open_recording(recording) as rec:

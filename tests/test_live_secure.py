@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from live_net import Collector, attachment, compiled, free_port, running, until
 from test_live_listen import MODEL, message
 
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 
@@ -134,7 +134,7 @@ def test_certificates_and_access_control(folder):
     port = free_port()
     config = folder / "robot.json5"
     config.write_text(RULES.replace("PORT", str(port)).replace("FOLDER", str(folder)))
-    job = Listen(
+    job = ListenJob(
         PlainNames("robot/*/events"),
         folder / "model",
         emit="10ms",

@@ -12,13 +12,13 @@ from live_net import Collector, ListSink, attachment, compiled, free_port, plain
 from test_live_listen import CLASSIFIER, MODEL, batches, listener, message
 
 from streamfeat.errors import InputError
-from streamfeat.live.listen import Listen
+from streamfeat.files.safetensors_file import read_safetensors
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import RosNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
-from streamfeat.messages import EventPacket, LabelMessage
-from streamfeat.safe_arrays import read_safetensors
+from streamfeat.messages.cdr import EventPacket, LabelMessage
 
 # --- which share
 
@@ -220,7 +220,7 @@ def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
 
 def test_a_ros_camera_that_announces_itself_is_heard(files):
     port, sink, asked = free_port(), ListSink(), RosNames("/cam/*/events")
-    job = Listen(asked, files / "model", emit="10ms", port=port, announced=True, silence_s=1e9)
+    job = ListenJob(asked, files / "model", emit="10ms", port=port, announced=True, silence_s=1e9)
     names = RosNames("/cam/a/events")
     with open_session(port=port) as net, running(job, more=sink):
         others = RosNames("/other/events")
@@ -246,12 +246,12 @@ def test_a_ros_camera_that_announces_itself_is_heard(files):
 LISTENER = """
 import json, sys
 from pathlib import Path
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.shard import Shard
 model, state, port, shard = sys.argv[1:]
 never = dict(silence_s=1e9, patience_s=1e9, max_delay_s=1e9, state_every_s=0.02)
-job = Listen(
+job = ListenJob(
     PlainNames("cam/*/events"), Path(model), emit="10ms", port=int(port), state=Path(state),
     shard=Shard.parse(shard), **never,
 )

@@ -13,12 +13,12 @@ from test_live_listen import MODEL, message
 
 pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
-from streamfeat.cluster import local
+from streamfeat.live.cluster import ClusterListen, ServedCamera
 from streamfeat.live.names import PlainNames, RosNames
 from streamfeat.live.network import TopicWatch, open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.live.spread import Served, Spread
-from streamfeat.messages import EventPacket
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.work.cluster import local
 
 PACKET_US = 10_000
 
@@ -77,7 +77,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
     state = tmp_path / "state" if keeps_state else None
     lines = []
     options = {"port": port, "emit": "10ms", "state": state, "say": lines.append}
-    job = Spread(PlainNames("robot/*/events"), two, model, **options)
+    job = ClusterListen(PlainNames("robot/*/events"), two, model, **options)
     until(lambda: len(two.processes()) == 2, "two workers")
     with open_session(port=port) as session, running(job):
         features = Collector(session, "robot/*/features")
@@ -132,7 +132,7 @@ def test_topics_are_found_by_their_tokens_alone():
 def test_one_camera_without_a_wildcard_needs_no_token_and_a_configuration_goes_along(two, model, tmp_path):
     port, config = free_port(), tmp_path / "client.json5"
     config.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]}}))
-    job = Spread(PlainNames("robot/0/events"), two, model, port=1, zenoh_config=config, emit="10ms")
+    job = ClusterListen(PlainNames("robot/0/events"), two, model, port=1, zenoh_config=config, emit="10ms")
     with open_session(port=port) as session, running(job):
         publisher = session.declare_publisher("robot/0/events")
         until(lambda: publisher.matching_status.matching, "a subscriber")
@@ -153,7 +153,7 @@ def told(packets, unheard=0, lost=0, **more):
 
 
 def test_what_a_dead_worker_may_have_lost_is_counted():
-    one = Served()
+    one = ServedCamera()
     one.hear("a", told(0, begins=True))
     one.hear("a", told(10, 5, 1))
     one.hear("b", told(0, begins=True))
@@ -166,7 +166,7 @@ def test_what_a_dead_worker_may_have_lost_is_counted():
 
 
 def test_what_a_state_has_kept_is_counted_once():
-    one = Served()
+    one = ServedCamera()
     one.hear("a", told(0, begins=True))
     one.hear("a", told(10, 5, 1))
     one.hear("b", told(7, 5, begins=True))
@@ -178,7 +178,7 @@ def test_what_a_state_has_kept_is_counted_once():
     one.hear("c", told(11, 5, 12))
     assert one.missed == 0
     assert one.counts() | {"packets": 14, "events": 140, "lost": 9} == one.counts()
-    later = Served()
+    later = ServedCamera()
     later.hear("c", told(100, 5, begins=True))
     later.hear("c", told(103, 5, 2))
     assert (later.first_unheard, later.missed) == (105, 0)
@@ -186,7 +186,7 @@ def test_what_a_state_has_kept_is_counted_once():
 
 
 def test_a_worker_that_was_given_up_is_not_listened_to():
-    one = Served()
+    one = ServedCamera()
     one.hear("a", told(0, begins=True))
     one.hear("a", told(10))
     one.hear("b", told(0, begins=True))
@@ -204,7 +204,7 @@ def test_a_worker_that_was_given_up_is_not_listened_to():
     ],
 )
 def test_refusals_are_one_line(run, model, options, reason, monkeypatch):
-    monkeypatch.setattr("streamfeat.cluster._PATIENCE_S", 0.5)
+    monkeypatch.setattr("streamfeat.work.cluster._PATIENCE_S", 0.5)
     result = run("listen", "a/*/events", "-m", model, *options)
     assert (result.status, result.err.count("\n")) == (2, 1)
     assert reason in result.err

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
-from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 
 EVENTS = make_events([1, 500, 3], [7, 2, 400], [1, 0, 1], [2_000_001, 2_000_000, 3_999_999])
 F32 = np.array([1.5, -2.0, np.inf], np.float32)

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from streamfeat.events import make_events
-from streamfeat.mcap_records import Losses
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, Part, Recording, Sample, open_recording
+from streamfeat.recordings.reader import Label, Part, Recording, Sample, open_recording
+from streamfeat.recordings.records import Losses
+from streamfeat.recordings.writer import RecordingWriter
 
 RESOLUTION = (60, 80)
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat.emission import EmitPolicy
 from streamfeat.errors import InputError
-from streamfeat.pipeline import Pipeline, run_until_interrupted
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import open_recording
-from streamfeat.replay import Replay
-from streamfeat.session import Session
-from streamfeat.sinks import JsonLinesSink, RecordingSink, TerminalSink
+from streamfeat.recordings.reader import open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.replay import ReplayJob
+from streamfeat.stream.session import Session
+from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, TerminalSink
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL, [str(digit) for digit in range(10)])
@@ -455,7 +455,7 @@ def test_the_terminal_without_labels():
 def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
     MODEL.save(tmp_path / "model")
     (tmp_path / "out.mcap.part").write_bytes(b"left over")
-    job = Replay(digits, tmp_path / "model")
+    job = ReplayJob(digits, tmp_path / "model")
     with pytest.raises(InputError, match="left by a writer"):
         job.run(recording_out=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "out.mcap.part"]
@@ -465,4 +465,4 @@ def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
 def test_bad_speeds_are_refused(tmp_path, digits, text):
     MODEL.save(tmp_path / "model")
     with pytest.raises(InputError, match="--speed"):
-        Replay(digits, tmp_path / "model", speed=text)
+        ReplayJob(digits, tmp_path / "model", speed=text)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from streamfeat.errors import InputError
-from streamfeat.places import Location, open_binary, place_of, size_of
-from streamfeat.recorder import recover
-from streamfeat.recording import Packet, open_recording
+from streamfeat.files.locations import StoreLocation, location_of, open_binary, size_of
+from streamfeat.recordings.reader import Packet, open_recording
+from streamfeat.recordings.writer import recover
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "recordings" / "digits_test.mcap"
@@ -44,8 +44,8 @@ def items(source):
     "text", ["a.mcap", "/data/a.mcap", "C:\\data\\a.mcap", "robot/a::b", "a//b.mcap", "1://x", ":memory:"]
 )
 def test_a_plain_path_stays_a_path(text):
-    assert place_of(text) == Path(text)
-    assert place_of(Path(text)) == Path(text)
+    assert location_of(text) == Path(text)
+    assert location_of(Path(text)) == Path(text)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ def test_a_plain_path_stays_a_path(text):
     ],
 )
 def test_a_url_is_a_location_with_the_name_of_its_file(url, name):
-    place = place_of(url)
-    assert isinstance(place, Location)
+    place = location_of(url)
+    assert isinstance(place, StoreLocation)
     assert (place.url, place.name, place.suffix) == (url, name, Path(name).suffix)
-    assert place_of(place) is place
+    assert location_of(place) is place
     assert pickle.loads(pickle.dumps(place)) == place
 
 
@@ -79,8 +79,8 @@ def test_a_url_is_a_location_with_the_name_of_its_file(url, name):
     ],
 )
 def test_what_is_secret_in_a_url_is_not_shown(url, shown):
-    assert str(Location(url)) == shown
-    assert repr(Location(url)) == f"Location({shown!r})"
+    assert str(StoreLocation(url)) == shown
+    assert repr(StoreLocation(url)) == f"StoreLocation({shown!r})"
 
 
 def test_errors_do_not_show_what_is_secret(run):
@@ -89,7 +89,7 @@ def test_errors_do_not_show_what_is_secret(run):
         done = run("info", url)
         assert done.status == 2
         assert "geheim" not in done.out + done.err
-        assert done.err.startswith(f"error: {Location(url)}: ")
+        assert done.err.startswith(f"error: {StoreLocation(url)}: ")
         assert "Traceback" not in done.err
         assert done.err.count("\n") == 1
 
@@ -104,7 +104,7 @@ def test_every_kind_of_url_gives_what_the_path_gives(memory, tmp_path):
         f"zip://{SOURCE.name}::file://{tmp_path}/a.zip",
     ):
         assert items(url) == expected
-        assert size_of(Location(url)) == SOURCE.stat().st_size
+        assert size_of(StoreLocation(url)) == SOURCE.stat().st_size
 
 
 def test_two_who_read_one_file_do_not_move_each_other(memory):
@@ -115,7 +115,7 @@ def test_two_who_read_one_file_do_not_move_each_other(memory):
 
 def test_any_part_of_a_stored_file_can_be_read(memory):
     data = SOURCE.read_bytes()
-    with open_binary(Location(memory)) as file:
+    with open_binary(StoreLocation(memory)) as file:
         assert file.read(8) == data[:8]
         assert file.seek(-8, 2) == len(data) - 8
         assert file.read() == data[-8:]

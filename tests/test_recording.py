@@ -14,14 +14,14 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from streamfeat import mcap_records
-from streamfeat.codecs import ENCODINGS, make_decoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
-from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.packets import PacketWriter
-from streamfeat.recorder import RecordingWriter, recover
-from streamfeat.recording import WHOLE, Label, Packet, Topic, open_recording
+from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, make_decoder
+from streamfeat.messages.packets import PacketWriter
+from streamfeat.recordings import records as mcap_records
+from streamfeat.recordings.reader import WHOLE, Label, Packet, Topic, open_recording
+from streamfeat.recordings.writer import RecordingWriter, recover
 
 RESOLUTION = (60, 80)
 LABEL = Label(1_000, 400_000, "car", "train", "a.dat")
@@ -85,7 +85,7 @@ def test_real_recording(shared_data):
 # --- what is written is read back
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", PAYLOAD_ENCODINGS)
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 def test_round_trip(tmp_path, encoding, compression):
     # silences of 3 and 20 s: longer than a packet, and longer than 24 bits of microseconds

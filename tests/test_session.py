@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat.classifier import Classifier
-from streamfeat.emission import EmitPolicy
+from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.features import EventFeatures, encode_samples, sample_end
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
-from streamfeat.features import EventFeatures, encode_samples, sample_end
-from streamfeat.geometry import Geometry
-from streamfeat.packets import Tick
-from streamfeat.recording import Label, Packet, Sample
-from streamfeat.session import Session
+from streamfeat.messages.packets import Watermark
+from streamfeat.recordings.reader import Label, Packet, Sample
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 MODEL = tiny.encoder()
 WINDOW = tiny.GEOMETRY.window_us
@@ -368,7 +368,7 @@ def test_a_classifier_of_another_model_is_refused():
 
 def test_learning_online_predicts_first():
     """Equal to the plain loop: predict with what is known, then learn."""
-    from streamfeat.classifier import OnlineClassifier
+    from streamfeat.classify.classifier import OnlineClassifier
 
     names = ("cat", "dog", "owl")
     items = tiny.labelled_items(40, names=names)
@@ -403,7 +403,7 @@ def run_live(items, policy, **options):
 def test_ticks_read_what_decays_and_then_nothing(policy):
     batch = tiny.steady(10_000, 20_000, 50)
     packet = replace(tiny.packet(batch), source_ns=7)
-    ticks = [Tick("", t) for t in range(20_000, 5 * WINDOW, 3_000)]
+    ticks = [Watermark("", t) for t in range(20_000, 5 * WINDOW, 3_000)]
     emissions, session = run_live([packet, *ticks], policy)
     of_events = len(run_live([packet], policy)[0])
     assert [e.source_ns for e in emissions] == [7] * of_events + [0] * (len(emissions) - of_events)
@@ -419,7 +419,7 @@ def test_ticks_read_what_decays_and_then_nothing(policy):
     assert not silent[-1].features.any()
     assert session.stats().events == 50
     # One tick of hours says the same, and later events are not late.
-    far, session = run_live([tiny.packet(batch), Tick("", 10**12)], policy)
+    far, session = run_live([tiny.packet(batch), Watermark("", 10**12)], policy)
     assert times(far) == times(emissions)
     more = list(session.process(tiny.packet(tiny.steady(WINDOW, WINDOW + 100, 20))))
     assert session.stats().late == 0
@@ -429,18 +429,18 @@ def test_ticks_read_what_decays_and_then_nothing(policy):
 def test_a_tick_ends_a_sample():
     label = Label(10_000, 80_000, "cat")
     items = [label, tiny.packet(tiny.steady(10_000, 50_000, 100))]
-    emissions, session = run_live([*items, Tick("", 89_999)], "1000ev")
+    emissions, session = run_live([*items, Watermark("", 89_999)], "1000ev")
     assert not any(e.final for e in emissions)
-    final = next(iter(session.process(Tick("", 90_000))))
+    final = next(iter(session.process(Watermark("", 90_000))))
     assert (final.final, final.t_us) == (True, 90_000)
     assert np.array_equal(
         final.features, run_live([*items, Label(500_000, 1, "x")], "1000ev")[0][-1].features
     )
-    assert list(session.process(Tick("", 10**9))) == []
+    assert list(session.process(Watermark("", 10**9))) == []
 
 
 def test_ticks_before_any_event_say_nothing():
-    assert run_live([Tick("", 10**9)], "10ms")[0] == []
+    assert run_live([Watermark("", 10**9)], "10ms")[0] == []
 
 
 @pytest.mark.parametrize("policy", ["10ms", "7ev", "auto"])

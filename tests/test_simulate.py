@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from streamfeat.events import EVENT_DTYPE
-from streamfeat.simulate import CameraModel, Saccades, digit_samples, events_from_frames, simulate_saccades
+from streamfeat.simulate.saccades import (
+    CameraModel,
+    Saccades,
+    digit_samples,
+    events_from_frames,
+    simulate_saccades,
+)
 
 IDEAL = {"threshold_mismatch": 0.0, "noise_hz": 0.0}
 DOT = np.pad([[1.0]], 3)

@@ -17,23 +17,23 @@ from live_net import Collector, attachment, compiled, free_port, plain_session, 
 from streams import KINDS, cases, streams
 from test_live_listen import MODEL, batches, message, replayed
 
-from streamfeat.cameras import Cameras
-from streamfeat.emission import EmitPolicy
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
 from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health
 from streamfeat.live.inbox import Inbox, RawMessage
 from streamfeat.live.intake import Intake, Warnings
-from streamfeat.live.keep import Keeper, read_state
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.live.topic import Mark
-from streamfeat.messages import EventPacket, FeaturesMessage
-from streamfeat.packets import Label, Packet, Tick
-from streamfeat.safe_arrays import read_safetensors, write_safetensors
-from streamfeat.session import Session
+from streamfeat.live.topic import Barrier
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage
+from streamfeat.messages.packets import Label, Packet, Watermark
+from streamfeat.stream.cameras import Cameras
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 RANDOM = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 KEY = "cam/a/events"
@@ -120,7 +120,7 @@ class Job:
         self.health = Health(self.cameras, self.intake, self.inbox, Warnings())
         self.failures = []
         parts = self.health, self.cameras, self.intake, self.failures.append
-        self.keeper = Keeper(path, MODEL.fingerprint, *parts)
+        self.keeper = Checkpointer(path, MODEL.fingerprint, *parts)
 
     def process(self, items):
         return [e for item in items for e in self.keeper.process(item)]
@@ -141,7 +141,7 @@ def some_items(rng, n=12):
         if what == 0:
             items.append(Label(now, int(rng.integers(1, 90_000)), "cat", topic=topic))
         elif what <= 2:
-            items.append(Tick(topic, now + step))
+            items.append(Watermark(topic, now + step))
         else:
             epoch += int(what == 3)
             size = (20, 24) if what == 4 else tiny.RESOLUTION
@@ -166,7 +166,7 @@ def test_sessions_that_are_restored_anywhere_go_on_with_the_same_bits(policy, se
     got = job.process(items[:place])
     if got:
         job.keeper.write(got)
-    job.process([Mark(job.intake.snapshot())])
+    job.process([Barrier(job.intake.snapshot())])
     job.die()
     again = Job(path, policy)
     rest = again.process(items[place:])
@@ -187,7 +187,7 @@ def test_another_policy_may_go_on(tmp_path):
     list(job.keeper.finish())
     job.die()
     again = Job(path, "7000us")
-    assert [e.t_us for e in again.process([Tick("/events", 60_000)])] == [49_000, 56_000]
+    assert [e.t_us for e in again.process([Watermark("/events", 60_000)])] == [49_000, 56_000]
     again.die()
 
 
@@ -196,9 +196,9 @@ def test_readings_between_events_and_silences_do_not_go_back():
     session = Session(MODEL, EmitPolicy.parse("event"))
     items = [
         tiny.packet(tiny.stream([0, 10])),
-        Tick("", 60_000),
+        Watermark("", 60_000),
         tiny.packet(tiny.stream([5_000_000])),
-        Tick("", 5_060_000),
+        Watermark("", 5_060_000),
     ]
     times = [e.t_us for item in items for e in session.process(item)]
     assert times == [1, 11, 50_000, 5_000_001, 5_050_000]
@@ -213,7 +213,7 @@ def test_a_file_never_says_more_than_was_written(tmp_path):
     job = Job(path)
     packets = [tiny.packet(events) for events in batches(8)]
     first, second = job.process(packets[:4]), None
-    job.process([Mark({})])
+    job.process([Barrier({})])
     second = job.process(packets[4:])
     assert first
     assert second
@@ -222,7 +222,7 @@ def test_a_file_never_says_more_than_was_written(tmp_path):
     assert not path.exists()
     job = Job(path)
     first = job.process(packets[:4])
-    job.process([Mark({})])
+    job.process([Barrier({})])
     job.keeper.write(first)
     job.die()
     again = Job(path)
@@ -246,7 +246,7 @@ def test_what_was_kept_at_the_end_is_from_before_the_end(tmp_path):
 
 def test_a_file_that_cannot_be_written_does_not_end_the_job(tmp_path):
     job = Job(tmp_path / "none" / "state")
-    job.process([Mark({})])
+    job.process([Barrier({})])
     job.keeper.write([])
     job.die(failures=1)
     (failure,) = job.failures
@@ -277,7 +277,7 @@ def test_numbers_clocks_and_decoders_go_on(encoding, tmp_path):
     plain, job = Job(tmp_path / "none"), Job(path)
     for at, i in enumerate(order):
         if at == 6:
-            job.process([Mark(job.intake.snapshot())])
+            job.process([Barrier(job.intake.snapshot())])
             job.die()
             job = Job(path)
         one, two = (put(each, sent[i], i, as_=encoding) for each in (plain, job))
@@ -362,7 +362,7 @@ def test_a_state_with_any_value_replaced_is_refused_in_one_line_or_does_no_harm(
             assert str(path) in error
             continue
         job.process(put(job, batches(8)[6], 6))
-        job.process([Tick(KEY, 2_000_000), tiny.packet(tiny.steady(60_000, 90_000, 50))])
+        job.process([Watermark(KEY, 2_000_000), tiny.packet(tiny.steady(60_000, 90_000, 50))])
         list(job.keeper.finish())
         job.die()
     assert refused > 150
@@ -401,12 +401,12 @@ def test_a_state_that_is_cut_or_of_another_model_is_refused(sound, tmp_path):
 LISTENER = """
 import sys
 from pathlib import Path
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 model, state, port, reliable = sys.argv[1:]
 never = dict(silence_s=1e9, patience_s=1e9, max_delay_s=1e9)
 never |= dict(port=int(port), reliable=reliable == "True", state=Path(state), state_every_s=0.02)
-job = Listen(PlainNames("cam/*/events"), Path(model), emit="10ms", **never)
+job = ListenJob(PlainNames("cam/*/events"), Path(model), emit="10ms", **never)
 job.run()
 import json
 print(json.dumps(job.result()))
@@ -529,7 +529,7 @@ def test_a_mark_comes_when_something_came(tmp_path):
         if item is None and len(items) > 4:
             job.inbox.close()
     job.die()
-    assert [type(item) for item in items if item is not None] == [Packet, Mark]
+    assert [type(item) for item in items if item is not None] == [Packet, Barrier]
 
 
 def test_no_polarity_and_no_events_are_no_state():

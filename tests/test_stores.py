@@ -10,15 +10,15 @@ import tiny
 from test_datasets import bin40_bytes, put, sample_events
 from test_places import SOURCE, items
 
-from streamfeat import places
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
 from streamfeat.evaluate.run import evaluate
 from streamfeat.evaluate.splits import DataSet
+from streamfeat.files import locations as places
+from streamfeat.files.locations import StoreLocation, size_of
 from streamfeat.foreign.datasets import convert
-from streamfeat.places import Location, size_of
-from streamfeat.recording import open_recording
+from streamfeat.recordings.reader import open_recording
 
 s3fs = pytest.importorskip("s3fs", reason="stores need the extra `store`")
 moto = pytest.importorskip("moto.server", reason="an S3 server comes with the extra `test`")
@@ -90,7 +90,7 @@ def is_one_line(error, url):
 
 def test_a_recording_in_s3_is_the_same(store, small_blocks):
     assert items(store.url) == items(SOURCE)
-    assert size_of(Location(store.url)) == SOURCE.stat().st_size
+    assert size_of(StoreLocation(store.url)) == SOURCE.stat().st_size
     assert items(f"simplecache::{store.url}") == items(SOURCE)
 
 
@@ -114,7 +114,9 @@ def test_info_learn_and_replay_give_the_same_from_s3(store, digits, run, tmp_pat
 def test_an_evaluation_that_was_begun_from_s3_goes_on_from_a_copy(store, digits, tmp_path, monkeypatch):
     cells = plan_cells(["counts"], {}, [], 1)
     state = tmp_path / "state"
-    begun = evaluate(DataSet([Location(store.put(digits))], None, 5, 0), cells, early_samples=0, state=state)
+    begun = evaluate(
+        DataSet([StoreLocation(store.put(digits))], None, 5, 0), cells, early_samples=0, state=state
+    )
     monkeypatch.setattr("streamfeat.evaluate.run.run_cells", None)  # all is done
     after = evaluate(DataSet([digits], None, 5, 0), cells, early_samples=0, state=state)
     assert begun == after
@@ -275,7 +277,7 @@ def test_a_web_server_that_does_not_give_all_is_one_line(web, small_blocks, run,
     url = f"{web}/{how}/a.mcap?sig={SECRET}"
     done = run("info", url)
     assert done.status == 2
-    assert is_one_line(done.err, str(Location(url)))
+    assert is_one_line(done.err, str(StoreLocation(url)))
     assert re.search(what, done.err)
 
 
@@ -285,7 +287,7 @@ def test_a_replay_that_a_store_leaves_has_no_output(web, small_blocks, run, tmp_
     model = SOURCE.with_name("digits.safetensors")
     done = run("replay", url, "-m", model, "-o", outputs[0], "--json-lines", outputs[1], "-q")
     assert (done.status, done.out) == (2, "")
-    assert is_one_line(done.err, str(Location(url)))
+    assert is_one_line(done.err, str(StoreLocation(url)))
     assert [*tmp_path.iterdir()] == []
 
 
@@ -297,5 +299,5 @@ def test_a_part_in_a_cache_is_no_recording(web):
     """What a cache keeps of a file that it could not fetch, it takes for the file the next time."""
     url = f"simplecache::{web}/half/a.mcap"
     for what in ("cannot be read: ", rf"\d+ of {len(DATA)} bytes were fetched; start again"):
-        with pytest.raises(InputError, match=rf"^{Location(url)}: {what}"):
+        with pytest.raises(InputError, match=rf"^{StoreLocation(url)}: {what}"):
             open_recording(url)

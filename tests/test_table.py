@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat import table
-from streamfeat.emission import Emission
 from streamfeat.errors import InputError
-from streamfeat.recording import Label
+from streamfeat.recordings.reader import Label
+from streamfeat.stream import table
+from streamfeat.stream.emission import Emission
 
 pa = pytest.importorskip("pyarrow", reason="extra export is not installed")
 pq = pytest.importorskip("pyarrow.parquet", reason="extra export is not installed")
@@ -84,14 +84,14 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch):
 
 
 def test_a_replay_writes_a_table(tmp_path):
-    from streamfeat.replay import Replay
+    from streamfeat.stream.replay import ReplayJob
 
     model = tiny.encoder()
     model.save(tmp_path / "model")
     recording = tiny.write_items(tmp_path / "in.mcap", tiny.labelled_items(4))
     clf = tiny.classifier(model)
     clf.save(tmp_path / "clf")
-    job = Replay(recording, tmp_path / "model", tmp_path / "clf", emit="20ms")
+    job = ReplayJob(recording, tmp_path / "model", tmp_path / "clf", emit="20ms")
     job.run(table=tmp_path / "out.parquet")
     found = pq.read_table(tmp_path / "out.parquet")
     assert found.num_rows == job.result()["emissions"]

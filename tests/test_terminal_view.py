@@ -7,10 +7,10 @@ import pytest
 import tiny
 from rich.console import Console
 
-from streamfeat.emission import Emission
+from streamfeat.demo.terminal import EventPicture, TerminalView
 from streamfeat.events import make_events
-from streamfeat.recording import Label
-from streamfeat.terminal_view import EventPicture, TerminalView
+from streamfeat.recordings.reader import Label
+from streamfeat.stream.emission import Emission
 
 
 def terminal(width=60, **options):

@@ -20,11 +20,11 @@ from view_client import Client
 pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 
 from streamfeat.cli import app
-from streamfeat.codecs import encode
 from streamfeat.errors import InputError
 from streamfeat.live.names import PlainNames, RosNames
-from streamfeat.live.publish import Publish
-from streamfeat.messages import EventPacket
+from streamfeat.live.publish import PublishJob
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.codecs import encode
 from streamfeat.view.job import View, prefix_of
 
 MODEL = tiny.encoder(k=3)
@@ -208,7 +208,7 @@ def test_a_ros_camera_is_shown(files):
     view = View(
         names, files / "model", files / "classifier", emit="10ms", rate=1000, say=lines.append, port=port
     )
-    camera = Publish(
+    camera = PublishJob(
         [(files / "samples.mcap", "/event_camera/events")], names, speed=4.0, port=port, wait_s=30
     )
     with shown(view, publish=False):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat.engine import Engine
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.window import count_window
 from streamfeat.view import observe
 from streamfeat.view.observe import ObservedEngine, Pace, Slot, Watch
-from streamfeat.window import count_window
 
 MODEL = tiny.encoder(k=3)
 GEOMETRY = MODEL.geometry

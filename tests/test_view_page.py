@@ -18,8 +18,8 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from streamfeat.emission import Emission
 from streamfeat.errors import InputError
+from streamfeat.stream.emission import Emission
 from streamfeat.view.channels import LiveBoard
 from streamfeat.view.job import View
 from streamfeat.view.page import PageServer, page

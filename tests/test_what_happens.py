@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat.emission import EmitPolicy
 from streamfeat.errors import InputError
 from streamfeat.evaluate.run import StateFile
-from streamfeat.pipeline import Pipeline, run_until_interrupted, signals_wait
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import open_recording
-from streamfeat.session import Session
-from streamfeat.sinks import JsonLinesSink, RecordingSink
+from streamfeat.recordings.reader import open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.session import Session
+from streamfeat.stream.sinks import JsonLinesSink, RecordingSink
 
 ROOT = Path(__file__).parents[1]
-HERE = "test_what_happens.py"
+THIS_PROCESS = "test_what_happens.py"
 MODEL = tiny.encoder()
 
 ROWS = {
@@ -37,8 +37,10 @@ ROWS = {
         "test_recording.py::test_truncated_anywhere",
         "test_recording.py::test_bad_packets_are_counted_and_only_bad_packets_are_an_error",
     ],
-    "events lie outside the resolution, or have no polarity": [f"{HERE}::test_events_that_change_nothing"],
-    "events are older than the window": [f"{HERE}::test_events_that_change_nothing"],
+    "events lie outside the resolution, or have no polarity": [
+        f"{THIS_PROCESS}::test_events_that_change_nothing"
+    ],
+    "events are older than the window": [f"{THIS_PROCESS}::test_events_that_change_nothing"],
     "files of a data set cannot be read": [
         "test_datasets.py::test_bad_samples_are_reported_and_the_others_converted"
     ],
@@ -59,8 +61,8 @@ ROWS = {
         "test_pipeline.py::test_a_sink_that_fails_in_the_reader_ends_everything",
     ],
     "the disk is full": [
-        f"{HERE}::test_no_room_is_one_line_and_leaves_what_was_there",
-        f"{HERE}::test_a_recording_that_has_no_more_room_can_be_recovered",
+        f"{THIS_PROCESS}::test_no_room_is_one_line_and_leaves_what_was_there",
+        f"{THIS_PROCESS}::test_a_recording_that_has_no_more_room_can_be_recovered",
         "test_state.py::test_a_file_that_cannot_be_written_does_not_end_the_job",
     ],
     "a camera stalls": [
@@ -73,14 +75,16 @@ ROWS = {
     "Ctrl-C or SIGTERM, streams": [
         "test_cli.py::test_an_interrupted_replay_keeps_what_it_read",
         "test_live_cli.py::test_listen_ends_well_when_interrupted",
-        f"{HERE}::test_a_replay_ends_on_sigterm_as_on_ctrl_c",
+        f"{THIS_PROCESS}::test_a_replay_ends_on_sigterm_as_on_ctrl_c",
     ],
     "Ctrl-C or SIGTERM, `learn` and `evaluate`": [
         "test_cli.py::test_interrupted_learning_writes_the_model_so_far",
         "test_evaluate.py::test_an_interrupted_run_goes_on",
-        f"{HERE}::test_sigterm_ends_a_command_as_ctrl_c_does",
+        f"{THIS_PROCESS}::test_sigterm_ends_a_command_as_ctrl_c_does",
     ],
-    "Ctrl-C or SIGTERM, `convert` and `train`": [f"{HERE}::test_sigterm_ends_a_command_as_ctrl_c_does"],
+    "Ctrl-C or SIGTERM, `convert` and `train`": [
+        f"{THIS_PROCESS}::test_sigterm_ends_a_command_as_ctrl_c_does"
+    ],
     "`kill -9`, `record`": ["test_live_cli.py::test_record_survives_a_kill_with_all_but_the_last_chunk"],
     "`kill -9`, `listen --state`": ["test_state.py::test_a_listener_that_is_killed_goes_on_where_it_was"],
     "`kill -9`, `learn` and `evaluate`": [
@@ -164,7 +168,7 @@ def to_mcap(path):
 
 def to_table(path):
     pytest.importorskip("pyarrow")
-    from streamfeat.table import TableSink
+    from streamfeat.stream.table import TableSink
 
     run(TableSink(path, MODEL.n_features))
 
@@ -187,7 +191,7 @@ def test_no_room_is_one_line_and_leaves_what_was_there(write, room, tmp_path):
 
 
 def test_a_recording_that_has_no_more_room_can_be_recovered(tmp_path):
-    from streamfeat.recorder import recover
+    from streamfeat.recordings.writer import recover
 
     path, copy = tmp_path / "out.mcap", tmp_path / "copy.mcap"
     sent = [tiny.steady(i * 10_000, (i + 1) * 10_000, 100, seed=i) for i in range(50)]

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from streamfeat.classifier import Classifier
-from streamfeat.encoder import Encoder
+from streamfeat.classify.classifier import Classifier
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
-from streamfeat.geometry import Geometry
 from streamfeat.learn.volumes import sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, Packet, open_recording
-from streamfeat.simulate import Saccades, digit_samples
+from streamfeat.recordings.reader import Label, Packet, open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.simulate.saccades import Saccades, digit_samples
 
 GEOMETRY = Geometry(patch=4, stride=4, n_bins=2, bin_us=50_000, max_count=2)
 """A window of 100 ms."""

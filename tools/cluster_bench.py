@@ -23,22 +23,22 @@ from typing import Any
 
 import numpy as np
 
-from streamfeat.cluster import Cluster, local
-from streamfeat.encoder import Encoder
-from streamfeat.features import EncodedSamples, encode_recordings
+from streamfeat.classify.features import EncodedSamples, encode_recordings
+from streamfeat.engine.encoder import Encoder
 from streamfeat.learn.fit import learn_encoder
-from streamfeat.learn.setting import Setting
-from streamfeat.machine import Disturbance
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import open_recording
-from streamfeat.workers import Here, Workers
+from streamfeat.learn.settings import Setting
+from streamfeat.recordings.reader import open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.report.machine import Disturbance
+from streamfeat.work.cluster import Cluster, local
+from streamfeat.work.workers import ThreadWorkers, Workers
 
 CORES = os.cpu_count() or 1
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 
 PLACES: dict[str, Callable[[], contextlib.AbstractContextManager[Any]]] = {
-    f"this process, {CORES} threads": lambda: contextlib.nullcontext(Here()),
-    "this process, 1 thread": lambda: contextlib.nullcontext(Here(1)),
+    f"this process, {CORES} threads": lambda: contextlib.nullcontext(ThreadWorkers()),
+    "this process, 1 thread": lambda: contextlib.nullcontext(ThreadWorkers(1)),
     "1 worker, 1 thread": lambda: local(1, 1),
     "2 workers, 1 thread each": lambda: local(2, 1),
 }

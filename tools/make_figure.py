@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import streamfeat as sf
-from streamfeat.recording import Sample
+from streamfeat.recordings.reader import Sample
 
 ROOT = Path(__file__).resolve().parent.parent
 FIGURE = ROOT / "tools" / "how_it_works.svg"

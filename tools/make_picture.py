@@ -1,7 +1,7 @@
 """Draw the README's picture: the terminal during a replay of the recording that comes with the project.
 
 Lives here: running the replay and saving what it printed as SVG.
-Not here: what is printed (`streamfeat.sinks`).
+Not here: what is printed (`streamfeat.stream.sinks`).
 
     python tools/make_picture.py
 """
@@ -13,7 +13,7 @@ from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console
 
 from streamfeat.cli import program
-from streamfeat.replay import Replay
+from streamfeat.stream.replay import ReplayJob
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "tools" / "replay.svg"
@@ -25,7 +25,7 @@ COMMAND = (
 def main() -> None:
     recordings = ROOT / "recordings"
     console = Console(record=True, width=92, highlight=False, force_terminal=True, color_system="truecolor")
-    job = Replay(
+    job = ReplayJob(
         recordings / "digits_test.mcap",
         recordings / "digits.safetensors",
         recordings / "digits_classifier.safetensors",

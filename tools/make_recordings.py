@@ -1,7 +1,7 @@
 """Make the recordings that come with the project, or check that those here are the ones this makes.
 
 Lives here: how many digits, which seed, how they follow each other in time, and the sums of the files.
-Not here: the simulation (`streamfeat.simulate`) and the file format (`streamfeat.recorder`).
+Not here: the simulation (`streamfeat.simulate`) and the file format (`streamfeat.recordings`).
 
     python tools/make_recordings.py            # write digits_train.mcap, digits_test.mcap and SHA256SUMS
     python tools/make_recordings.py --models   # and learn a small model and classifier from the first of them
@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from streamfeat.events import Events
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label, open_recording
-from streamfeat.simulate import CameraModel, digit_samples
+from streamfeat.recordings.reader import Label, open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.simulate.saccades import CameraModel, digit_samples
 
 FOLDER = Path(__file__).resolve().parent.parent / "recordings"
 COUNTS = {"train": 250, "test": 100}

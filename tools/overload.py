@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 import streamfeat as sf
-from streamfeat.emission import Emission, EmitPolicy
-from streamfeat.latency.hop import without_silence
-from streamfeat.packets import Label, Packet
-from streamfeat.pipeline import Pipeline
-from streamfeat.session import Session
+from streamfeat.latency.end_to_end import without_silence
+from streamfeat.messages.packets import Label, Packet
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.session import Session
 
 TIMES = 10
 COMPARED = 200

@@ -171,7 +171,7 @@ def _in_short(row: dict[str, Any]) -> str:
 
 
 def _print(result: dict[str, Any]) -> None:
-    from streamfeat.evaluate.words import (
+    from streamfeat.evaluate.tables import (
         COLUMNS,
         base_rows,
         cells,

@@ -35,7 +35,7 @@ from streamfeat.cli.program import (
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
-    from streamfeat.encoder import Encoder
+    from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
 
 __all__ = ["learn", "train"]
@@ -84,10 +84,10 @@ def learn(
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
     After a crash there is the file MODEL.part, which --resume takes as well.
     """
-    from streamfeat.encoder import Encoder
+    from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import learn_encoder
-    from streamfeat.learn.setting import Setting
-    from streamfeat.recording import open_recording
+    from streamfeat.learn.settings import Setting
+    from streamfeat.recordings.reader import open_recording
 
     refuse_existing(model, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
@@ -169,10 +169,10 @@ def train(
     as_json: JsonOption = False,
 ) -> None:
     """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
-    from streamfeat.classifier import train_classifier
-    from streamfeat.encoder import Encoder
-    from streamfeat.features import encode_recordings, training_set
-    from streamfeat.recording import open_recording
+    from streamfeat.classify.classifier import train_classifier
+    from streamfeat.classify.features import encode_recordings, training_set
+    from streamfeat.engine.encoder import Encoder
+    from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
     encoder = Encoder.load(model)

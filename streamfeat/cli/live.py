@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from streamfeat.cli.program import (
-    AnyPlace,
+    AnyLocation,
     ClusterOption,
     JsonOption,
     ModelOption,
@@ -30,7 +30,7 @@ from streamfeat.cli.program import (
     working,
 )
 from streamfeat.errors import InputError
-from streamfeat.places import place_of
+from streamfeat.files.locations import location_of
 
 if TYPE_CHECKING:
     from streamfeat.live.names import Names
@@ -126,7 +126,7 @@ def listen(
     as_json: JsonOption = False,
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
-    from streamfeat.live.listen import Listen
+    from streamfeat.live.listen import ListenJob
     from streamfeat.live.shard import Shard
 
     for path in (output, json_lines, table):
@@ -151,7 +151,7 @@ def listen(
         _spread(names, model, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
     share = Shard.parse(shard) if shard is not None else None
-    job = Listen(
+    job = ListenJob(
         names, model, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
     )
     to_terminal = str(json_lines) == "-"
@@ -179,11 +179,11 @@ def _spread(
     as_json: bool,
 ) -> None:
     """`listen` on the workers of a cluster."""
-    from streamfeat.live.spread import Spread
+    from streamfeat.live.cluster import ClusterListen
 
     with working(cluster, workers, quiet=quiet) as place:
         say = (lambda line: None) if quiet else partial(err.print, markup=False, soft_wrap=True)
-        job = Spread(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
+        job = ClusterListen(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
         job.run()
     result = job.result()
     of_each = result.pop("of_each")
@@ -212,15 +212,15 @@ def publish(
 ) -> None:
     """Recordings as live cameras, at their own pace or faster; several at once."""
     from streamfeat.live.names import PlainNames, RosNames
-    from streamfeat.live.publish import Publish
-    from streamfeat.replay import parse_speed
+    from streamfeat.live.publish import PublishJob
+    from streamfeat.stream.replay import parse_speed
 
     if len(sources) % 2:
         raise InputError("give each recording a key: publish ONE.mcap cam0/events TWO.mcap cam1/events")
-    pairs = [(place_of(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
+    pairs = [(location_of(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
     for _, key in pairs:
         names = RosNames(key, domain) if ros2 else PlainNames(key)
-    job = Publish(
+    job = PublishJob(
         pairs,
         names,
         speed=parse_speed(speed),
@@ -252,10 +252,10 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
-    from streamfeat.live.record import Record
+    from streamfeat.live.record import RecordJob
 
     refuse_existing(output, overwrite=overwrite)
-    job = Record(
+    job = RecordJob(
         names_of(key, ros2, domain),
         output,
         compression=compression,  # type: ignore[arg-type]
@@ -274,8 +274,8 @@ def record(
 @app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
 def recover(
     source: Annotated[
-        AnyPlace,
-        typer.Argument(metavar="IN", help="Damaged recording, or its URL.", parser=place_of),
+        AnyLocation,
+        typer.Argument(metavar="IN", help="Damaged recording, or its URL.", parser=location_of),
     ],
     target: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="Recording to write.")],
     overwrite: OverwriteOption = False,
@@ -283,7 +283,7 @@ def recover(
     as_json: JsonOption = False,
 ) -> None:
     """Whatever can be read of a damaged recording, in a new and intact one."""
-    from streamfeat.recorder import recover as recover_recording
+    from streamfeat.recordings.writer import recover as recover_recording
 
     with progress_bars(quiet=quiet) as report:
         losses = recover_recording(source, target, overwrite=overwrite, report=report)

@@ -59,7 +59,7 @@ def latency(
     ] = 50_000,
     warm_up: Annotated[int, typer.Option(help="Events that run before any is counted.")] = 2_000,
     speed: Annotated[
-        float, typer.Option(help="Pace of the whole hop: 1 is the recorded one, 2 twice that.")
+        float, typer.Option(help="Pace of end to end: 1 is the recorded one, 2 twice that.")
     ] = 1.0,
     split: Annotated[str | None, typer.Option(help="Measure on samples of this split only.")] = None,
     plot: Annotated[
@@ -71,7 +71,7 @@ def latency(
     verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Per-event update latency and that of a whole hop: percentiles for each model and policy."""
+    """Per-event update latency and that of end to end: percentiles for each model and policy."""
     from streamfeat.latency.measure import LatencyReport
     from streamfeat.latency.picture import check_picture, draw
 
@@ -110,7 +110,7 @@ def latency(
 
 
 def _print(report: "LatencyReport") -> None:
-    from streamfeat.latency.words import COLUMNS, cells, describe, notes
+    from streamfeat.latency.text import COLUMNS, cells, describe, notes
 
     for name in dict.fromkeys(row.model.name for row in report.rows):
         rows = [row for row in report.rows if row.model.name == name]

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from streamfeat.learn.setting import DEFAULTS, PRESETS, preset_with
+from streamfeat.learn.settings import DEFAULTS, PRESETS, preset_with
 
 __all__ = [
     "Bins",

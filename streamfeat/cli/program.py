@@ -29,14 +29,14 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from streamfeat.errors import InputError
-from streamfeat.places import Place, place_of
+from streamfeat.files.locations import Location, location_of
 
 if TYPE_CHECKING:
-    from streamfeat.mcap_records import Losses
-    from streamfeat.workers import Workers
+    from streamfeat.recordings.records import Losses
+    from streamfeat.work.workers import Workers
 
 __all__ = [
-    "AnyPlace",
+    "AnyLocation",
     "ClusterOption",
     "JsonOption",
     "ModelOption",
@@ -89,16 +89,17 @@ out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
 
 if TYPE_CHECKING:
-    AnyPlace = Place
+    AnyLocation = Location
 else:
     # Typer knows no unions: help shows this name, and a command gets what the parser gives.
-    AnyPlace = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
+    AnyLocation = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
 RecordingArgument = Annotated[
-    AnyPlace, typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=place_of)
+    AnyLocation,
+    typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=location_of),
 ]
 RecordingsArgument = Annotated[
-    list[AnyPlace],
-    typer.Argument(metavar="REC...", help="MCAP recordings of events, or their URLs.", parser=place_of),
+    list[AnyLocation],
+    typer.Argument(metavar="REC...", help="MCAP recordings of events, or their URLs.", parser=location_of),
 ]
 TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
@@ -209,14 +210,14 @@ def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterato
     Raises:
         InputError: both are given, the extra is not installed, or the cluster cannot be used.
     """
-    from streamfeat.workers import HERE
+    from streamfeat.work.workers import THIS_PROCESS
 
     if cluster is None and workers is None:
-        yield HERE
+        yield THIS_PROCESS
         return
     if cluster is not None and workers is not None:
         raise InputError("--cluster and --workers exclude each other; give one")
-    from streamfeat.cluster import connected, local
+    from streamfeat.work.cluster import connected, local
 
     with connected(cluster) if cluster is not None else local(workers or 0) as found:
         if not quiet:

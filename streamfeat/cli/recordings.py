@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from streamfeat.cli.program import (
-    AnyPlace,
+    AnyLocation,
     ClusterOption,
     JsonOption,
     OverwriteOption,
@@ -26,7 +26,7 @@ from streamfeat.cli.program import (
     working,
 )
 from streamfeat.errors import InputError
-from streamfeat.places import place_of
+from streamfeat.files.locations import location_of
 
 __all__ = ["convert", "info"]
 
@@ -36,7 +36,7 @@ _FAULTS_SHOWN = 20
 @app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
 def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonOption = False) -> None:
     """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording."""
-    from streamfeat.recording import open_recording
+    from streamfeat.recordings.reader import open_recording
 
     with open_recording(recording, topic) as rec:
         with progress_bars() as report:
@@ -71,11 +71,11 @@ def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonO
 @app.command(epilog="Example: streamfeat convert n-cars_train ncars.mcap --split-every 5")
 def convert(
     source: Annotated[
-        AnyPlace,
-        typer.Argument(metavar="IN", help="Data set folder or camera file, or its URL.", parser=place_of),
+        AnyLocation,
+        typer.Argument(metavar="IN", help="Data set folder or camera file, or its URL.", parser=location_of),
     ],
     target: Annotated[
-        AnyPlace, typer.Argument(metavar="OUT.mcap", help="Recording to write.", parser=place_of)
+        AnyLocation, typer.Argument(metavar="OUT.mcap", help="Recording to write.", parser=location_of)
     ],
     split_every: Annotated[
         int | None,

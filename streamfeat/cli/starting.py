@@ -38,7 +38,7 @@ def demo(
 
     Takes up to a minute when kernels have to be compiled first; nothing is downloaded.
     """
-    from streamfeat.demo import FILES, Demo
+    from streamfeat.demo.demo import FILES, Demo
 
     if there := [name for name in FILES if (folder / name).exists()]:
         if not overwrite:
@@ -87,7 +87,7 @@ def doctor(as_json: JsonOption = False) -> None:
 
     The exit status is 1 where something keeps streamfeat from working as it should. Extras may be missing.
     """
-    from streamfeat.doctor import examine
+    from streamfeat.cli.installation import examine
 
     with progress_bars() as report:
         found = examine(lambda step: report("looking", 0, 0, step))

@@ -64,12 +64,12 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
-    from streamfeat.replay import Replay
+    from streamfeat.stream.replay import ReplayJob
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
-    job = Replay(
+    job = ReplayJob(
         recording,
         model,
         classifier,

@@ -24,7 +24,7 @@ from streamfeat.cli.program import (
     refuse_existing,
 )
 from streamfeat.errors import InputError
-from streamfeat.places import Location, Place, place_of
+from streamfeat.files.locations import Location, StoreLocation, location_of
 
 __all__ = ["view"]
 
@@ -54,7 +54,9 @@ def view(
     ] = None,
     live: Annotated[
         bool | None,
-        typer.Option("--live/--no-live", help="Serve, or only write -o. Served unless there is only -o."),
+        typer.Option(
+            "--live/--no-live", help="Serve, or only write -o. ServedCamera unless there is only -o."
+        ),
     ] = None,
     layout: Annotated[Path | None, typer.Option(help="Write a Foxglove layout (JSON) here.")] = None,
     rate: Annotated[float, typer.Option(help="Looks a second.")] = 20.0,
@@ -76,7 +78,7 @@ def view(
 
     A recording that is served begins when somebody looks, and its last picture stays until Ctrl-C.
     """
-    from streamfeat.report import require
+    from streamfeat.report.pages import require
 
     require("foxglove", extra="view", what="a view")
     from streamfeat.view.job import View
@@ -118,9 +120,9 @@ def view(
     print_result(job.result(), "viewed", as_json=as_json)
 
 
-def _recording(source: str | None) -> Place | None:
+def _recording(source: str | None) -> Location | None:
     """The recording that is meant, if it is one: a URL, a file that exists, or what is called as one."""
     if source is None:
         return None
-    place = place_of(source)
-    return place if isinstance(place, Location) or place.suffix == ".mcap" or place.is_file() else None
+    place = location_of(source)
+    return place if isinstance(place, StoreLocation) or place.suffix == ".mcap" or place.is_file() else None

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from streamfeat.classifier import Classifier, train_classifier
-from streamfeat.encoder import Encoder, FeatureMap
+from streamfeat.classify.classifier import Classifier, train_classifier
+from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
+from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.features import EncodedSamples, encode_recordings, training_set
-from streamfeat.machine import PeakMemory
-from streamfeat.recording import Recording, Sample
-from streamfeat.workers import HERE, Workers
+from streamfeat.recordings.reader import Recording, Sample
+from streamfeat.report.machine import PeakMemory
+from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["run_cells"]
 
@@ -26,7 +26,12 @@ _SHOWN_FILTERS = 48
 
 
 def run_cells(
-    data: DataSet, cells: Sequence[Cell], report: Report, *, early_samples: int, workers: Workers = HERE
+    data: DataSet,
+    cells: Sequence[Cell],
+    report: Report,
+    *,
+    early_samples: int,
+    workers: Workers = THIS_PROCESS,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells that the same features serve; results are JSON values.
 

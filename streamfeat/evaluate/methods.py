@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.encoder import Encoder, FeatureMap
+from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.fit import learn_encoder, prepare
-from streamfeat.learn.setting import Setting
-from streamfeat.recording import Recording
-from streamfeat.workers import HERE, Sums, Workers
+from streamfeat.learn.settings import Setting
+from streamfeat.recordings.reader import Recording
+from streamfeat.work.workers import THIS_PROCESS, Sums, Workers
 
 __all__ = ["make_features", "random_filters", "spherical_means"]
 
@@ -28,7 +28,7 @@ def make_features(
     recordings: Sequence[Recording],
     setting: Setting,
     report: Report,
-    workers: Workers = HERE,
+    workers: Workers = THIS_PROCESS,
 ) -> FeatureMap:
     """Learn what a method learns, from samples that are not held out.
 

@@ -1,7 +1,7 @@
 """The result of an evaluation as one page.
 
 Lives here: which tables and figures it has, in which order, and the figures.
-Not here: the skeleton of a page (`streamfeat.report`), numbers as text (`words`).
+Not here: the skeleton of a page (`streamfeat.report.pages`), numbers as text (`words`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.evaluate.words import (
+from streamfeat.evaluate.tables import (
     COLUMNS,
     all_numbers,
     base_rows,
@@ -24,7 +24,7 @@ from streamfeat.evaluate.words import (
     sweep_tables,
     value_text,
 )
-from streamfeat.report import Section, Table, require, write_report
+from streamfeat.report.pages import Section, Table, require, write_report
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure

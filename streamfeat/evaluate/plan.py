@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from streamfeat.errors import InputError
-from streamfeat.learn.setting import Setting
+from streamfeat.learn.settings import Setting
 
 __all__ = ["METHODS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
 

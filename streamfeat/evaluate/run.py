@@ -25,10 +25,10 @@ from streamfeat.evaluate.scores import (
     time_to_share,
 )
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.files import write_atomically
-from streamfeat.machine import describe_machine
-from streamfeat.places import size_of
-from streamfeat.workers import HERE, Workers
+from streamfeat.files.atomic import write_atomically
+from streamfeat.files.locations import size_of
+from streamfeat.report.machine import describe_machine
+from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
@@ -126,7 +126,7 @@ def evaluate(
     state: Path | None = None,
     report: Report = lambda step, done, total, remark: None,
     finished: Callable[[dict[str, Any]], None] = lambda row: None,
-    workers: Workers = HERE,
+    workers: Workers = THIS_PROCESS,
 ) -> dict[str, Any]:
     """Run all cells that are not done, and add up the result (JSON values).
 

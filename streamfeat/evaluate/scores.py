@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from streamfeat.classifier import Classifier, OnlineClassifier
-from streamfeat.encoder import FeatureMap
-from streamfeat.features import encode_samples
-from streamfeat.recording import Sample
+from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.features import encode_samples
+from streamfeat.engine.encoder import FeatureMap
+from streamfeat.recordings.reader import Sample
 
 __all__ = [
     "bootstrap_interval",

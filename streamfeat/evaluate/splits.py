@@ -15,8 +15,16 @@ import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
 from streamfeat.errors import InputError
-from streamfeat.places import Place, absolute
-from streamfeat.recording import HELD_OUT_SPLITS, WHOLE, Label, Packet, Part, Recording, open_recording
+from streamfeat.files.locations import Location, absolute
+from streamfeat.recordings.reader import (
+    HELD_OUT_SPLITS,
+    WHOLE,
+    Label,
+    Packet,
+    Part,
+    Recording,
+    open_recording,
+)
 
 __all__ = ["DataSet", "Fold"]
 
@@ -32,7 +40,7 @@ class Fold(Recording):
     """
 
     def __init__(
-        self, path: Place, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
+        self, path: Location, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
     ) -> None:
         """Open it."""
         self._held_out = held_out
@@ -84,7 +92,7 @@ class DataSet:
     """
 
     def __init__(
-        self, paths: Sequence[Place], topic: str | None, folds: int, seed: int, on: str = "held-out"
+        self, paths: Sequence[Location], topic: str | None, folds: int, seed: int, on: str = "held-out"
     ) -> None:
         """Read the labels."""
         if on not in ("held-out", "train"):
@@ -155,7 +163,7 @@ class DataSet:
                 ]
 
 
-def _check_labels(path: Place, labels: Sequence[Label]) -> None:
+def _check_labels(path: Location, labels: Sequence[Label]) -> None:
     if not labels:
         raise InputError(f"{path}: has no labelled samples; `streamfeat convert` writes labels")
     missing = [i for i, label in enumerate(labels) if not label.label]

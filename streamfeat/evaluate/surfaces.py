@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
-from streamfeat.recording import HELD_OUT_SPLITS, Recording, Sample
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording, Sample
 
 __all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
 

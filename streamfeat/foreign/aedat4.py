@@ -25,7 +25,7 @@ import zstandard
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
-from streamfeat.foreign.words import Source, checked_resolution
+from streamfeat.foreign.prophesee import Source, checked_resolution
 
 __all__ = ["aedat4_resolution", "read_aedat4"]
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.foreign.hdf5_process import FRAME
+from streamfeat.foreign.prophesee import Source, declared_resolution
 from streamfeat.foreign.tables import checked_events, named_columns, one_line
-from streamfeat.foreign.words import Source, declared_resolution
 
 __all__ = ["hdf5_resolution", "read_hdf5"]
 

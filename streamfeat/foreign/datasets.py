@@ -1,7 +1,7 @@
 """Folders of foreign event files -> labelled samples -> one recording.
 
 Lives here: the folder layouts of data sets, where samples stand in time, and the conversion to MCAP.
-Not here: the formats of single files (`event_files`) and MCAP itself (`streamfeat.recorder`).
+Not here: the formats of single files (`event_files`) and MCAP itself (`streamfeat.recordings.writer`).
 """
 
 import contextlib
@@ -16,11 +16,11 @@ import numpy as np
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
+from streamfeat.files.locations import Location, StoreLocation, fetched, files_below, is_folder, location_of
 from streamfeat.foreign.event_files import EXTENSIONS, open_events
-from streamfeat.places import Location, Place, fetched, files_below, is_folder, place_of
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import Label
-from streamfeat.workers import HERE, Workers
+from streamfeat.recordings.reader import Label
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["Conversion", "SamplePath", "convert", "find_samples"]
 
@@ -41,7 +41,7 @@ _HELD_IN_MEMORY = 2 << 20  # bytes of a file, at most 96 times that in events; l
 class SamplePath:
     """One sample: its file, class, split ("" where no folder names one) and relative path."""
 
-    path: Place
+    path: Location
     label: str
     split: str
     source: str
@@ -57,8 +57,8 @@ class Conversion:
 
     samples: int
     events: int
-    failed: list[tuple[Place, str]]
-    damaged: list[tuple[Place, str]]
+    failed: list[tuple[Location, str]]
+    damaged: list[tuple[Location, str]]
     bytes_in: int
     bytes_out: int
 
@@ -105,7 +105,7 @@ class _Look:
     error: str = ""
 
 
-def find_samples(folder: str | Path | Location) -> list[SamplePath]:
+def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     """Find the labelled samples of a data set folder.
 
     A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
@@ -122,11 +122,11 @@ def find_samples(folder: str | Path | Location) -> list[SamplePath]:
     Raises:
         InputError: there is no such folder, or no sample in it.
     """
-    folder = place_of(folder)
+    folder = location_of(folder)
     if not is_folder(folder):
         raise InputError(f"{folder}: is no folder")
     samples = []
-    name = folder.name if isinstance(folder, Location) else folder.resolve().name
+    name = folder.name if isinstance(folder, StoreLocation) else folder.resolve().name
     for path, source in _files(folder):
         *above, _ = parts = source.split("/")
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
@@ -144,9 +144,9 @@ def find_samples(folder: str | Path | Location) -> list[SamplePath]:
     return sorted(samples, key=lambda sample: sample.source)
 
 
-def _files(folder: Place) -> Iterable[tuple[Place, str]]:
+def _files(folder: Location) -> Iterable[tuple[Location, str]]:
     """Files in a folder, however deep, each with its path from there."""
-    if isinstance(folder, Location):
+    if isinstance(folder, StoreLocation):
         return files_below(folder)
     # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
     return (
@@ -157,8 +157,8 @@ def _files(folder: Place) -> Iterable[tuple[Place, str]]:
 
 
 def convert(
-    source: str | Path | Location,
-    out: str | Path | Location,
+    source: str | Path | StoreLocation,
+    out: str | Path | StoreLocation,
     *,
     overwrite: bool = False,
     gap_us: int = 1_000_000,
@@ -168,7 +168,7 @@ def convert(
     compression: Literal["zstd", "lz4", "none"] = "zstd",
     limit: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    workers: Workers = HERE,
+    workers: Workers = THIS_PROCESS,
 ) -> Conversion:
     """Convert a data set folder, or one event file, to a recording.
 
@@ -188,7 +188,7 @@ def convert(
         split: name for the split of all samples, instead of what their folders say.
         split_every: every such sample (5: index 4, 9, ...) is split "validation" and the others "train".
             Samples in test folders stay "test" and are not counted.
-        encoding: of the packets, see `streamfeat.codecs.ENCODINGS`.
+        encoding: of the packets, see `streamfeat.messages.codecs.PAYLOAD_ENCODINGS`.
         compression: of the chunks, see `RecordingWriter`.
         limit: convert only so many samples, as many of each label as the others have.
         progress: called with samples done and samples in all, after each.
@@ -197,8 +197,8 @@ def convert(
     Raises:
         InputError: `source` cannot be read at all, `out` cannot be written, or an argument is out of range.
     """
-    source, out = place_of(source), place_of(out)
-    if isinstance(out, Location):
+    source, out = location_of(source), location_of(out)
+    if isinstance(out, StoreLocation):
         raise InputError(f"{out}: recordings are written to local files; give one, and copy it to the store")
     if gap_us <= 0 or (limit is not None and limit <= 0) or (split_every is not None and split_every < 2):
         raise InputError("gap_us and limit must be positive, split_every at least 2")
@@ -223,7 +223,7 @@ def convert(
     return replace(done, bytes_out=out.stat().st_size)
 
 
-def _write_file(place: Place, writer: RecordingWriter) -> tuple[int, str, int]:
+def _write_file(place: Location, writer: RecordingWriter) -> tuple[int, str, int]:
     """Write one file as it is; return its number of events, its damage and its bytes."""
     with fetched(place) as path:
         try:
@@ -234,12 +234,12 @@ def _write_file(place: Place, writer: RecordingWriter) -> tuple[int, str, int]:
         return file.n, damage, path.stat().st_size
 
 
-def _of_place(error: InputError, path: Path, place: Place) -> str:
+def _of_place(error: InputError, path: Path, place: Location) -> str:
     """What is wrong with a file, by the name that its user knows."""
     return str(error).replace(str(path), str(place))
 
 
-def _write_events(path: Place, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
+def _write_events(path: Location, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
     for batch in file.batches:
         moved = batch.copy()
         moved["t"] += shift_us
@@ -285,14 +285,14 @@ def _write_samples(
     return Conversion(len(samples) - len(failed), n_events, failed, damaged, bytes_in, 0)
 
 
-def _look(place: Place, data_set: _DataSet | None) -> "_Look | None":
+def _look(place: Location, data_set: _DataSet | None) -> "_Look | None":
     """Read a file, if it is small enough to be held."""
     with fetched(place) as path:
         is_large = path.exists() and path.stat().st_size > _HELD_IN_MEMORY
         return None if is_large else _look_at(path, place, data_set)
 
 
-def _look_at(path: Path, place: Place, data_set: _DataSet | None) -> "_Look":
+def _look_at(path: Path, place: Location, data_set: _DataSet | None) -> "_Look":
     """Read a file, which is at `path` now."""
     try:
         file, damage = _measure(path, data_set)

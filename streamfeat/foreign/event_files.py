@@ -2,7 +2,7 @@
 
 Lives here: which format a file has, its resolution where it says so, and its events, read lazily in batches.
 Not here: the formats themselves (`words`, `aedat4`, `containers`, `tables`), folders and labels (`datasets`),
-and MCAP (`streamfeat.recording`).
+and MCAP (`streamfeat.recordings.reader`).
 """
 
 from collections.abc import Callable, Iterator
@@ -15,8 +15,7 @@ from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 from streamfeat.foreign.aedat4 import aedat4_resolution, read_aedat4
 from streamfeat.foreign.containers import hdf5_resolution, read_hdf5
-from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
-from streamfeat.foreign.words import (
+from streamfeat.foreign.prophesee import (
     declared_resolution,
     percent_header,
     read_bin40,
@@ -25,6 +24,7 @@ from streamfeat.foreign.words import (
     read_evt3,
     start_of_dat,
 )
+from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
 
 __all__ = ["EXTENSIONS", "FORMATS", "EventFile", "ForeignFile", "open_events", "read_events"]
 

@@ -21,8 +21,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from streamfeat.conventions import FIELD_NAMES
 from streamfeat.errors import InputError
+from streamfeat.events import FIELD_NAMES
 
 __all__ = ["FRAME", "serve"]
 

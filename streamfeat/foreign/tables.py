@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.conventions import FIELD_NAMES
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution, make_events
-from streamfeat.foreign.words import BLOCK_BYTES, Source, checked_resolution
+from streamfeat.events import FIELD_NAMES, Events, Resolution, make_events
+from streamfeat.foreign.prophesee import BLOCK_BYTES, Source, checked_resolution
 
 __all__ = [
     "HEAD_BYTES",

@@ -2,7 +2,7 @@
 
 Lives here: the two encodings of 16-bit words, one short loop each, writing to `out`.
 Not here: payload checks, capacity, and the encodings of fixed-size records, which NumPy reads by itself;
-see `streamfeat.codecs`.
+see `streamfeat.messages.codecs`.
 """
 
 import numpy as np

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SOFT, SPLIT, TRIANGLE = 0, 1, 2
-ENCODINGS = {"soft": SOFT, "split": SPLIT, "triangle": TRIANGLE}
+FEATURE_ENCODINGS = {"soft": SOFT, "split": SPLIT, "triangle": TRIANGLE}
 
 LANES = 32
 """Filters are padded with zeros to a multiple of this, so that no vector loop has a tail."""

@@ -1,4 +1,4 @@
-"""One latency report: every model with every emission policy, update and whole hop.
+"""One latency report: every model with every emission policy, update and end to end.
 
 Lives here: opening what a report needs, the order of measurements, rows, the result as JSON values.
 Not here: the measurements (`update`, `hop`), how rows look (`picture`, `cli`).
@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
+from streamfeat.files.locations import Location
+from streamfeat.latency.end_to_end import measure_end_to_end
 from streamfeat.latency.histogram import Latencies
-from streamfeat.latency.hop import hop
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
-from streamfeat.machine import Disturbance, describe_machine
-from streamfeat.places import Place
-from streamfeat.recording import Label, Packet, Recording, open_recording
-from streamfeat.replay import items_of_split
+from streamfeat.recordings.reader import Label, Packet, Recording, open_recording
+from streamfeat.report.machine import Disturbance, describe_machine
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.replay import items_of_split
 
 __all__ = ["LatencyReport", "Model", "Row"]
 
@@ -89,7 +89,7 @@ class LatencyReport:
         warm_up: events at the start that run but are not counted.
         limit_events: events to count at most in each measurement of updates.
         seconds: clock seconds that each measurement takes at most.
-        speed: of the whole hop, a multiple of the recorded pace.
+        speed: of the end to end, a multiple of the recorded pace.
         look_ahead: prepare bin boundaries beforehand where every event is followed.
 
     Raises:
@@ -98,7 +98,7 @@ class LatencyReport:
 
     def __init__(
         self,
-        recording: Place,
+        recording: Location,
         models: Sequence[Path],
         emits: Sequence[str],
         *,
@@ -215,9 +215,9 @@ class LatencyReport:
 
     def _rows_of(self, job: "_Job") -> Iterator[Row]:
         if job.policy == EmitPolicy("events", 1):
-            steps = [self._updates, self._calls, self._hop]
+            steps = [self._updates, self._calls, self._end_to_end]
         else:
-            steps = [self._readings, self._hop]
+            steps = [self._readings, self._end_to_end]
         for step in steps:
             if not job.stopped():
                 yield from step(job)
@@ -245,19 +245,19 @@ class LatencyReport:
         yield job.row("ingest", Latencies(each_event, found.batch_events))
         yield job.row("reading", Latencies(found.reading_ns))
 
-    def _hop(self, job: "_Job") -> Iterator[Row]:
+    def _end_to_end(self, job: "_Job") -> Iterator[Row]:
         ends: list[float] = []
 
         def goes() -> bool:
             if not ends:  # what warms up comes before the first question
-                job.tell(0, 0, f"whole hop, {self._seconds:g} s")
+                job.tell(0, 0, f"end to end, {self._seconds:g} s")
                 ends.append(time.monotonic() + self._seconds)
             going = time.monotonic() < ends[0] and not job.stopped()
             if not going:
-                job.tell(0, 0, "whole hop, what is still queued")
+                job.tell(0, 0, "end to end, what is still queued")
             return going
 
-        took = hop(
+        took = measure_end_to_end(
             job.model.encoder,
             items_of_split(job.recording.items(), self._split),
             job.policy,
@@ -266,7 +266,7 @@ class LatencyReport:
             warm_up=_first_events(self._items, self._warm_up),
             goes=goes,
         )
-        yield job.row("whole hop", Latencies(took))
+        yield job.row("end to end", Latencies(took))
 
     def _budget(self, job: "_Job", what: str) -> Callable[[int], bool]:
         """Says, told how many events are done, whether to go on; the clock starts after the warm-up."""

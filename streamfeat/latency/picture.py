@@ -1,7 +1,7 @@
 """Pictures of a latency report: an interactive page, or a static one.
 
 Lives here: percentile curves, latency over stream time.
-Not here: measuring (`measure`), numbers as text (`words`), the skeleton of a page (`streamfeat.report`).
+Not here: measuring (`measure`), numbers as text (`text`), the skeleton of a page (`streamfeat.report`).
 """
 
 import io
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.files import write_atomically
+from streamfeat.files.atomic import write_atomically
 from streamfeat.latency.measure import LatencyReport, Row
+from streamfeat.latency.text import COLUMNS, cells, describe, notes
 from streamfeat.latency.update import Walk
-from streamfeat.latency.words import COLUMNS, cells, describe, notes
-from streamfeat.report import Section, Table, require, write_report
+from streamfeat.report.pages import Section, Table, require, write_report
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure
@@ -34,7 +34,7 @@ _DASHES = {
     "from Python": "dashdot",
     "ingest": "dotted",
     "reading": "solid",
-    "whole hop": "dashed",
+    "end to end": "dashed",
 }
 _MATPLOTLIB_DASHES = {"solid": "-", "dotted": ":", "dashed": "--", "dashdot": "-."}
 _TICKS = {1: "0 %", 10: "90 %", 100: "99 %", 1_000: "99.9 %", 10_000: "99.99 %", 100_000: "99.999 %"}

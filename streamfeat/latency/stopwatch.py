@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from streamfeat.engine import Engine
+from streamfeat.engine.engine import Engine
 from streamfeat.events import Events
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, Operator, State

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution
 from streamfeat.latency.stopwatch import follow_timed
-from streamfeat.recording import Label, Packet
-from streamfeat.session import Session
+from streamfeat.recordings.reader import Label, Packet
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 __all__ = ["Readings", "Walk", "call_each", "feed_and_read", "walk"]
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import validate_data
 
 from streamfeat.errors import InputError
-from streamfeat.workers import HERE, Sums, Workers
+from streamfeat.work.workers import THIS_PROCESS, Sums, Workers
 
 __all__ = ["ChunkedVolumes", "Rows", "checked_volumes"]
 
@@ -44,7 +44,7 @@ class ChunkedVolumes:
     """
 
     def __init__(
-        self, source: Rows, size: int = 2048, make: Make | None = None, workers: Workers = HERE
+        self, source: Rows, size: int = 2048, make: Make | None = None, workers: Workers = THIS_PROCESS
     ) -> None:
         """Hand the chunks to the workers."""
         starts = range(0, source.shape[0], size)

@@ -17,7 +17,7 @@ from streamfeat.kernels.lasso import solve_lasso_rows
 from streamfeat.learn.alternation import Alternation, Step
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.omega import Omega
-from streamfeat.workers import Sums
+from streamfeat.work.workers import Sums
 
 __all__ = ["DictionaryLearner"]
 

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
-from streamfeat.geometry import Geometry
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
-from streamfeat.learn.setting import Setting
+from streamfeat.learn.settings import Setting
 from streamfeat.learn.transform import TransformLearner
 from streamfeat.learn.volumes import KEYS, Volumes, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Losses, Recording
-from streamfeat.workers import HERE, Workers
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Losses, Recording
+from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["Material", "geometry_of", "learn_encoder", "prepare"]
 
@@ -42,7 +42,9 @@ Keep = Callable[[Callable[[], Encoder]], None]
 """Called after each iteration with a function that makes the encoder so far."""
 
 
-def geometry_of(setting: Setting, recordings: Sequence[Recording], workers: Workers = HERE) -> Geometry:
+def geometry_of(
+    setting: Setting, recordings: Sequence[Recording], workers: Workers = THIS_PROCESS
+) -> Geometry:
     """The geometry that a setting means for these recordings.
 
     Args:
@@ -93,7 +95,7 @@ class Material:
 
 
 def prepare(
-    recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers = HERE
+    recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers = THIS_PROCESS
 ) -> Material:
     """Sample volumes and learn their whitening; samples of held-out splits are not looked at.
 
@@ -182,7 +184,7 @@ def learn_encoder(
     resume: Encoder | None = None,
     report: Report = lambda step, done, total, remark: None,
     keep: Keep = lambda make: None,
-    workers: Workers = HERE,
+    workers: Workers = THIS_PROCESS,
 ) -> Encoder:
     """Learn an encoder without labels; samples of held-out splits are not looked at.
 

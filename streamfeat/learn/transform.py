@@ -16,7 +16,7 @@ from streamfeat.errors import InputError
 from streamfeat.learn.alternation import Alternation, Step
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.omega import Omega
-from streamfeat.workers import Sums
+from streamfeat.work.workers import Sums
 
 __all__ = ["TransformLearner"]
 

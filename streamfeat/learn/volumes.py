@@ -12,10 +12,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.window import count_window
 from streamfeat.events import Events, Resolution
-from streamfeat.geometry import Geometry
-from streamfeat.recording import HELD_OUT_SPLITS, Label, Packet
-from streamfeat.window import count_window
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Packet
 
 __all__ = ["KEYS", "Volumes", "Window", "sample_volumes", "windows_of"]
 

@@ -13,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from streamfeat.errors import InputError
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
-from streamfeat.workers import Sums
+from streamfeat.work.workers import Sums
 
 __all__ = ["VolumeWhitener"]
 

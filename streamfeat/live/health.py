@@ -14,14 +14,14 @@ from wsgiref.simple_server import WSGIServer
 from prometheus_client import CollectorRegistry, Histogram, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from streamfeat.cameras import Cameras, Gone
-from streamfeat.emission import Emission
 from streamfeat.errors import InputError
-from streamfeat.live.delivery import DeliveryStats
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake, Warnings
-from streamfeat.pipeline import PipelineStats
-from streamfeat.session import StreamItem
+from streamfeat.messages.delivery import DeliveryStats
+from streamfeat.stream.cameras import CameraLeft, Cameras
+from streamfeat.stream.emission import Emission
+from streamfeat.stream.pipeline import PipelineStats
+from streamfeat.stream.session import StreamItem
 
 __all__ = ["CameraFigures", "Health", "parse_address"]
 
@@ -114,7 +114,7 @@ class Health:
         self._latest: dict[str, Emission] = {}
         self.registry.register(self)
 
-    def process(self, item: StreamItem | Gone) -> Iterator[Emission]:
+    def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
         """Process an item with the cameras; only what they take of the clock is counted."""
         spent = 0.0
         readings = self._cameras.process(item)
@@ -128,7 +128,7 @@ class Health:
             yield emission
         self._update.observe(spent)
         self._latest_update.add(spent)
-        if isinstance(item, Gone):
+        if isinstance(item, CameraLeft):
             self._latest.pop(item.topic, None)
 
     def rest(self) -> None:

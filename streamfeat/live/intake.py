@@ -19,23 +19,23 @@ from typing import Any, Self
 import numpy as np
 from rich.console import Console
 
-from streamfeat.cameras import Gone
 from streamfeat.errors import InputError
-from streamfeat.json_fields import Fields
-from streamfeat.live.clock import CameraClock
-from streamfeat.live.delivery import DeliveryStats
+from streamfeat.files.json_fields import Fields
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.names import Attachment
 from streamfeat.live.topic import (
     MAX_LABEL_US,
-    MAX_PACKET_EVENTS,
+    MAX_LIVE_PACKET_EVENTS,
     MAX_STREAM_US,
     MAX_TOPICS,
-    Mark,
+    Barrier,
     TopicState,
 )
-from streamfeat.messages import EventPacket, LabelMessage
-from streamfeat.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader, Tick
+from streamfeat.messages.cdr import EventPacket, LabelMessage
+from streamfeat.messages.clock import CameraClock
+from streamfeat.messages.delivery import DeliveryStats
+from streamfeat.messages.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader, Watermark
+from streamfeat.stream.cameras import CameraLeft
 
 __all__ = ["MAX_PAYLOAD_BYTES", "Intake", "Warnings"]
 
@@ -142,13 +142,13 @@ class Intake:
             InputError: it is none.
         """
         now_ns = time.monotonic_ns()
-        state = TopicState(PacketReader(topic, MAX_PACKET_EVENTS), CameraClock(self._window_us))
+        state = TopicState(PacketReader(topic, MAX_LIVE_PACKET_EVENTS), CameraClock(self._window_us))
         state.restore(values, now_ns - passed_ns)
         state.heard_ns = now_ns
         self.topics[topic] = state
         self._awaited[topic] = 0.0
 
-    def __iter__(self) -> Iterator[Packet | Label | Tick | Gone | Mark | None]:
+    def __iter__(self) -> Iterator[Packet | Label | Watermark | CameraLeft | Barrier | None]:
         """Yield items as they come; None when nothing more is there at the moment."""
         looked = marked = time.monotonic()
         is_new = False
@@ -158,7 +158,7 @@ class Intake:
             now = time.monotonic()
             is_new |= bool(taken)
             if is_new and now >= marked + self._mark_s:
-                yield Mark(self.snapshot())
+                yield Barrier(self.snapshot())
                 is_new, marked = False, now
             # Time during which this process was stopped says nothing about a camera's silence.
             passed_s = min(now - looked, 2 * _POLL_S)
@@ -187,14 +187,14 @@ class Intake:
         if topic in self.topics:
             self.topics[topic].delivery.announced(here=here)
 
-    def _release(self, topic: str, state: TopicState) -> Gone:
+    def _release(self, topic: str, state: TopicState) -> CameraLeft:
         """Nobody publishes here any more: what comes next is another life of this camera."""
-        state.reader = PacketReader(topic, MAX_PACKET_EVENTS)
+        state.reader = PacketReader(topic, MAX_LIVE_PACKET_EVENTS)
         state.clock = CameraClock(self._window_us)
         state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
-        return Gone(topic)
+        return CameraLeft(topic)
 
-    def _releases(self, passed_s: float) -> Iterator[Gone]:
+    def _releases(self, passed_s: float) -> Iterator[CameraLeft]:
         for topic, awaited_s in list(self._awaited.items()):
             self._awaited[topic] = awaited_s + passed_s
             if awaited_s > _RESTORED_S:
@@ -207,7 +207,7 @@ class Intake:
                 if topic in self.topics:
                     yield self._release(topic, self.topics[topic])
 
-    def _items(self, message: RawMessage | Announcement) -> Iterator[Packet | Label | Tick | Gone]:
+    def _items(self, message: RawMessage | Announcement) -> Iterator[Packet | Label | Watermark | CameraLeft]:
         if isinstance(message, Announcement):
             self._announced(message.topic, here=message.here)
             return
@@ -246,7 +246,7 @@ class Intake:
         state.label_end_us = label.start_us + label.duration_us
         return replace(label, topic=topic)
 
-    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Tick | Gone]:
+    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Watermark | CameraLeft]:
         if message.topic not in self.topics:
             yield from self._begin(message.topic)
         state = self.topics[message.topic]
@@ -286,7 +286,7 @@ class Intake:
         yield replace(packet, lost=state.lost)
         state.lost = 0
         if len(packet.events) == 0 and state.stream_us is not None:
-            yield Tick(message.topic, state.stream_us)
+            yield Watermark(message.topic, state.stream_us)
 
     def _placed(self, state: TopicState, message: RawMessage, numbered: Attachment) -> Packet:
         """Decode a packet and bring its times onto the stream's."""
@@ -342,7 +342,7 @@ class Intake:
         reason = message.problem or "no sequence number"
         raise _RefusalError(reason, f"{len(message.attachment)} bytes of attachment")
 
-    def _begin(self, topic: str) -> Iterator[Gone]:
+    def _begin(self, topic: str) -> Iterator[CameraLeft]:
         """Follow one topic more; the one that has been silent for longest makes room for it."""
         if len(self.topics) >= MAX_TOPICS:
             oldest = min(self.topics, key=lambda name: self.topics[name].heard_ns)
@@ -350,13 +350,13 @@ class Intake:
                 raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
             self._past = self._past + self.topics.pop(oldest).delivery.stats
             self._awaited.pop(oldest, None)
-            yield Gone(oldest)
-        reader = PacketReader(topic, MAX_PACKET_EVENTS)
+            yield CameraLeft(oldest)
+        reader = PacketReader(topic, MAX_LIVE_PACKET_EVENTS)
         state = self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
         if topic in self._leaving:
             state.delivery.announced(here=False)
 
-    def _silences(self, passed_s: float) -> Iterator[Tick]:
+    def _silences(self, passed_s: float) -> Iterator[Watermark]:
         for topic, state in self.topics.items():
             if state.stream_us is None or topic in self._awaited:
                 continue
@@ -364,7 +364,7 @@ class Intake:
             now_us = state.stream_us + int((state.silent_s - self._silence_s) * 1e6)
             end_us = max(state.stream_us + 2 * self._window_us, state.label_end_us + 1)
             if state.stream_us < now_us and now_us - int(passed_s * 1e6) <= end_us:
-                yield Tick(topic, now_us)
+                yield Watermark(topic, now_us)
 
 
 class _RefusalError(Exception):

@@ -15,32 +15,32 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.live import Live
 
-from streamfeat.cameras import Cameras, Gone
-from streamfeat.classifier import Classifier
-from streamfeat.codecs import ENCODINGS, encode, make_decoder
-from streamfeat.emission import Emission, EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.classify.classifier import Classifier
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import SILENCE_S, Intake, Warnings
-from streamfeat.live.keep import Keeper, read_state
 from streamfeat.live.names import Names, beside
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.publisher import OutputSink
 from streamfeat.live.screen import HealthTable
 from streamfeat.live.shard import Shard
-from streamfeat.live.topic import Mark
-from streamfeat.packets import Packet
-from streamfeat.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
-from streamfeat.recorder import RecordingWriter
-from streamfeat.session import Session, StreamItem
-from streamfeat.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
-from streamfeat.table import TableSink
+from streamfeat.live.topic import Barrier
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
+from streamfeat.messages.packets import Packet
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.cameras import CameraLeft, Cameras
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
+from streamfeat.stream.session import Session, StreamItem
+from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
+from streamfeat.stream.table import TableSink
 
-__all__ = ["Listen"]
+__all__ = ["ListenJob"]
 
 PATIENCE_S = 0.05
 """A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
@@ -49,7 +49,7 @@ MAX_DELAY_S = 1.0
 _DRAWN_A_SECOND = 4
 
 
-class Listen:
+class ListenJob:
     """Listens on topics until `stop` or a signal.
 
     Args:
@@ -182,8 +182,12 @@ class Listen:
                 (lambda: more) if more else None,
                 self._keeper if self._state else None,
             )
-            processor: Processor[Any, Emission] = sinks[-1] if isinstance(sinks[-1], Keeper) else self.health
-            pipeline: Pipeline[StreamItem | Gone | Mark, Emission] = Pipeline(self._intake, processor, sinks)
+            processor: Processor[Any, Emission] = (
+                sinks[-1] if isinstance(sinks[-1], Checkpointer) else self.health
+            )
+            pipeline: Pipeline[StreamItem | CameraLeft | Barrier, Emission] = Pipeline(
+                self._intake, processor, sinks
+            )
             self.health.queues = pipeline.stats
             try:
                 if self._address:
@@ -213,7 +217,7 @@ class Listen:
         geometry = self._encoder.geometry
         side = geometry.patch * geometry.downsample
         event = make_events([0], [0], [1], [0])
-        for encoding in ENCODINGS:
+        for encoding in PAYLOAD_ENCODINGS:
             payload, base_ns = encode(event, encoding)
             make_decoder(encoding).decode(payload, base_ns)
         # In time and too late, however long compiling takes: the two ways to feed.
@@ -246,10 +250,10 @@ class Listen:
             engine=engine or self._engine_of(topic),
         )
 
-    def _keeper(self) -> Keeper:
+    def _keeper(self) -> Checkpointer:
         assert self._state
         parts = self.health, self._cameras, self._intake
-        return Keeper(
+        return Checkpointer(
             self._state,
             self._encoder.fingerprint,
             *parts,

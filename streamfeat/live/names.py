@@ -16,8 +16,8 @@ from hashlib import blake2b
 from typing import NamedTuple, Protocol
 
 from streamfeat.errors import InputError
-from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.packets import EVENT_SCHEMAS
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.packets import EVENT_SCHEMAS
 
 __all__ = [
     "ATTACHMENT_BYTES",

@@ -30,7 +30,7 @@ from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, PlainNames, RosNames, ros_entity_token
 from streamfeat.live.shard import Shard
 from streamfeat.live.topic import MAX_TOPICS
-from streamfeat.packets import EVENT_SCHEMAS
+from streamfeat.messages.packets import EVENT_SCHEMAS
 
 __all__ = ["DEFAULT_PORT", "FoundTopic", "Subscription", "TopicWatch", "find_topics", "open_session"]
 

@@ -14,22 +14,22 @@ from typing import Any
 import zenoh
 
 from streamfeat.errors import InputError
+from streamfeat.files.locations import Location
 from streamfeat.live.names import Names
 from streamfeat.live.network import DEFAULT_PORT, open_session
 from streamfeat.live.publisher import CameraSink
-from streamfeat.messages import EventPacket, LabelMessage
-from streamfeat.packets import Label, Packet, PacketWriter
-from streamfeat.pipeline import Pipeline, run_until_interrupted
-from streamfeat.places import Place
-from streamfeat.recording import open_recording
-from streamfeat.sinks import open_sinks
+from streamfeat.messages.cdr import EventPacket, LabelMessage
+from streamfeat.messages.packets import Label, Packet, PacketWriter
+from streamfeat.recordings.reader import open_recording
+from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.sinks import open_sinks
 
-__all__ = ["Publish"]
+__all__ = ["PublishJob"]
 
 _POLL_S = 0.01
 
 
-class Publish:
+class PublishJob:
     """Plays recordings to topics, each on its own.
 
     Args:
@@ -49,7 +49,7 @@ class Publish:
 
     def __init__(
         self,
-        sources: list[tuple[Place, str]],
+        sources: list[tuple[Location, str]],
         names: Names,
         *,
         speed: float | None = 1.0,

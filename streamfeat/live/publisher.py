@@ -11,8 +11,6 @@ from collections.abc import Callable, Sequence
 import zenoh
 import zenoh.ext
 
-from streamfeat.cameras import MAX_CAMERAS
-from streamfeat.emission import Emission
 from streamfeat.errors import InputError
 from streamfeat.live.names import (
     OUTPUTS,
@@ -25,7 +23,9 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
-from streamfeat.messages import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.stream.cameras import MAX_CAMERAS
+from streamfeat.stream.emission import Emission
 
 __all__ = ["CameraSink", "MessagePublisher", "OutputSink"]
 

@@ -17,18 +17,18 @@ from typing import Any, Literal
 from rich.console import Console
 
 from streamfeat.errors import InputError
-from streamfeat.live.delivery import Delivery, DeliveryStats
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
 from streamfeat.live.topic import MAX_TOPICS
-from streamfeat.messages import EventArray, EventPacket, LabelMessage
-from streamfeat.pipeline import Pipeline, run_until_interrupted, signals_wait
-from streamfeat.recorder import RecordingWriter
-from streamfeat.sinks import open_sinks
+from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
+from streamfeat.messages.delivery import Delivery, DeliveryStats
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.sinks import open_sinks
 
-__all__ = ["Record"]
+__all__ = ["RecordJob"]
 
 _POLL_S = 0.05
 _MESSAGES = {kind.SCHEMA_NAME: kind for kind in (EventPacket, EventArray, LabelMessage)}
@@ -39,7 +39,7 @@ class _Flush:
     """Time to make safe what was written."""
 
 
-class Record:
+class RecordJob:
     """Records topics until `stop` or a signal.
 
     Args:

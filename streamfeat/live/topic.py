@@ -1,6 +1,6 @@
 """What is known of one topic, from message to message, and on request from one run of a program to the next.
 
-Lives here: `TopicState`, `Mark`, and the limits of what a topic may carry.
+Lives here: `TopicState`, `Barrier`, and the limits of what a topic may carry.
 Not here: what becomes of a message (`intake`).
 """
 
@@ -9,22 +9,22 @@ from typing import Any
 
 from streamfeat.errors import InputError
 from streamfeat.events import Resolution
-from streamfeat.json_fields import Fields
-from streamfeat.live.clock import CameraClock
-from streamfeat.live.delivery import Delivery
-from streamfeat.packets import MAX_PIXELS, PacketReader
+from streamfeat.files.json_fields import Fields
+from streamfeat.messages.clock import CameraClock
+from streamfeat.messages.delivery import Delivery
+from streamfeat.messages.packets import MAX_PIXELS, PacketReader
 
 __all__ = [
     "MAX_LABEL_US",
-    "MAX_PACKET_EVENTS",
+    "MAX_LIVE_PACKET_EVENTS",
     "MAX_STREAM_US",
     "MAX_TOPICS",
-    "Mark",
+    "Barrier",
     "TopicState",
     "resolution_in",
 ]
 
-MAX_PACKET_EVENTS = 1 << 20
+MAX_LIVE_PACKET_EVENTS = 1 << 20
 MAX_TOPICS = 256
 MAX_LABEL_US = 3_600_000_000
 MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US
@@ -91,7 +91,7 @@ class TopicState:
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class Barrier:
     """A place in the stream: what an intake knew when all items before this one had been taken from it."""
 
     topics: dict[str, dict[str, Any]]

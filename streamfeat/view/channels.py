@@ -19,8 +19,8 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import RawImage, Timestamp
 from numpy.typing import NDArray
 
-from streamfeat.cameras import MAX_CAMERAS
 from streamfeat.errors import InputError
+from streamfeat.stream.cameras import MAX_CAMERAS
 
 __all__ = ["Board", "FileBoard", "LiveBoard"]
 

@@ -12,16 +12,16 @@ from pathlib import Path
 from threading import Event, current_thread, main_thread
 from typing import Any
 
-from streamfeat.classifier import Classifier
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.classify.classifier import Classifier
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
-from streamfeat.files import replacing, write_atomically
-from streamfeat.live.listen import Listen
+from streamfeat.files.atomic import replacing, write_atomically
+from streamfeat.files.locations import Location
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names, beside
-from streamfeat.places import Place
-from streamfeat.replay import Replay, warm_up
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.replay import ReplayJob, warm_up
 from streamfeat.view.channels import Board, FileBoard, LiveBoard
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
@@ -52,7 +52,7 @@ class View:
         web_port: serve a page there, too.
         recording_out: MCAP file to write; replaced if it exists.
         say: told addresses, and what is waited for.
-        options: further ones of `Replay` or `Listen`.
+        options: further ones of `ReplayJob` or `ListenJob`.
 
     Raises:
         InputError: a file cannot be used, or an argument makes no sense.
@@ -60,7 +60,7 @@ class View:
 
     def __init__(
         self,
-        source: Place | Names,
+        source: Location | Names,
         model: Path,
         classifier: Path | None = None,
         *,
@@ -79,7 +79,7 @@ class View:
         self._live_port, self._web_port, self._recording_out = live_port, web_port, recording_out
         self._say = say
         self._looked, self._stopped = Event(), Event()
-        self._is_recording = isinstance(source, Place)
+        self._is_recording = isinstance(source, Location)
         self._boards: list[Board] = []
         self._sink = ViewSink(
             self._boards,
@@ -90,10 +90,10 @@ class View:
             drops=lambda: self._job.drops(),
         )
         common = {"model": model, "classifier": classifier, "emit": emit} | options
-        self._job: Replay | Listen = (
-            Replay(source, engine=self._engine_of(""), **common)
-            if isinstance(source, Place)
-            else Listen(source, engine_of=self._engine_of, **common)
+        self._job: ReplayJob | ListenJob = (
+            ReplayJob(source, engine=self._engine_of(""), **common)
+            if isinstance(source, Location)
+            else ListenJob(source, engine_of=self._engine_of, **common)
         )
         self._labels = Classifier.load(classifier).labels if classifier else ()
 
@@ -141,7 +141,7 @@ class View:
     def stop(self) -> None:
         """End listening, or waiting; a recording plays to its end. May be called from any thread."""
         self._stopped.set()
-        if isinstance(self._job, Listen):
+        if isinstance(self._job, ListenJob):
             self._job.stop()
 
     def result(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.engine import Engine, EngineStats
+from streamfeat.engine.engine import Engine, EngineStats
 from streamfeat.events import Events, Resolution
 
 __all__ = ["ObservedEngine", "Pace", "Sight", "Slot", "Updates", "Watch"]

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.emission import Emission
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
+from streamfeat.stream.emission import Emission
 from streamfeat.view.observe import Pace, Sight, Slot, Watch
 from streamfeat.view.pictures import bins_picture, event_picture, feature_columns, volume_picture
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 import streamfeat as sf
-from streamfeat.operator import with_fixed_point
+from streamfeat.engine.operator import with_fixed_point
 from tools.bench.floor import BUILDS, Floor, Walks, compile_floor, quadrants
 from tools.bench.material import Burst, Setting, Updates, random_encoder
 from tools.bench.timing import WALL, Contestant, Race, race

@@ -2,7 +2,7 @@
 
 Lives here: the part `latency`. Not here: the measurement, which is the program's own.
 
-Events come in recorded order, as fast as they follow each other; the whole hop through the pipeline is the
+Events come in recorded order, as fast as they follow each other; end to end through the pipeline is the
 command's matter. The same stream is gone through several times, and what counts is each event's median over
 the runs: a bin boundary costs the same event its time in every run, another program that takes the core
 seldom hits the same event twice. The figures of all runs as they came stand beside it.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import streamfeat as sf
-from streamfeat.recording import Packet
+from streamfeat.recordings.reader import Packet
 from tools.bench.material import Setting, random_encoder
 
 __all__ = ["measure_latency"]

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import streamfeat as sf
+from streamfeat.engine.window import count_window
 from streamfeat.events import Events, Resolution
-from streamfeat.learn import setting as learning
+from streamfeat.learn import settings as learning
 from streamfeat.learn.fit import geometry_of, learn_encoder
 from streamfeat.learn.initial import random_directions
 from streamfeat.learn.volumes import sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
-from streamfeat.recording import Label, Sample
-from streamfeat.window import count_window
+from streamfeat.recordings.reader import Label, Sample
 
 __all__ = ["Burst", "Material", "Setting", "Updates", "encoder_of", "random_encoder"]
 

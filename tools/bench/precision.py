@@ -14,7 +14,7 @@ import numpy as np
 from numba.core.runtime import _nrt_python, rtsys
 
 import streamfeat as sf
-from streamfeat.window import count_window
+from streamfeat.engine.window import count_window
 from tools.bench.inverse import whitened
 from tools.bench.material import Setting, Updates, encoder_of
 

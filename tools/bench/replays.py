@@ -13,7 +13,7 @@ from typing import Any
 from mcap.reader import NonSeekingReader
 
 import streamfeat as sf
-from streamfeat.replay import Replay
+from streamfeat.stream.replay import ReplayJob
 from tools.bench.material import Setting, encoder_of
 from tools.bench.timing import WALL, Contestant, race
 
@@ -62,7 +62,7 @@ def _measure(setting: Setting, path: Path, model: Path, events: int) -> dict[str
 
     def replay() -> None:
         nonlocal emissions
-        job = Replay(path, model, emit="10ms")
+        job = ReplayJob(path, model, emit="10ms")
         job.run()
         emissions = job.result()["emissions"]
 

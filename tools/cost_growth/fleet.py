@@ -15,9 +15,9 @@ from typing import Any
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.machine import Disturbance
-from streamfeat.messages import EventPacket
-from streamfeat.packets import PacketWriter
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.packets import PacketWriter
+from streamfeat.report.machine import Disturbance
 from tools.bench.material import Material
 from tools.cost_growth.model import Constants, work_of
 from tools.cost_growth.streams import SLICE_US, Setting, Stream

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 import streamfeat as sf
 from streamfeat.events import Events
 from streamfeat.latency.stopwatch import follow_timed
-from streamfeat.machine import Disturbance, describe_machine
+from streamfeat.report.machine import Disturbance, describe_machine
 from tools.bench.material import Material
 from tools.bench.timing import Contestant, race
 from tools.cost_growth.model import Constants, work_of

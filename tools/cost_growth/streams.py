@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 
 import streamfeat as sf
+from streamfeat.engine.operator import LANES
 from streamfeat.events import Events, Resolution
-from streamfeat.operator import LANES
 from tools.bench.direct import with_encoding
 from tools.bench.material import Material
 from tools.bench.scaling import flat_encoder

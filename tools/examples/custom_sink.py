@@ -3,7 +3,7 @@
     python tools/examples/custom_sink.py changes.csv
 
 Lives here: a sink of your own behind the pipeline that `streamfeat replay` uses.
-Not here: the sinks that come with streamfeat (`streamfeat.sinks`).
+Not here: the sinks that come with streamfeat (`streamfeat.stream.sinks`).
 """
 
 import csv
@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import streamfeat as sf
-from streamfeat.emission import Emission, EmitPolicy
-from streamfeat.pipeline import Pipeline, run_until_interrupted
-from streamfeat.session import Session
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.session import Session
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 

@@ -14,10 +14,10 @@ from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 import streamfeat as sf
-from streamfeat.classifier import normalise_features
+from streamfeat.classify.classifier import normalise_features
+from streamfeat.classify.svm import LinearSVM
 from streamfeat.learn.fit import learn_encoder
-from streamfeat.learn.setting import Setting
-from streamfeat.svm import LinearSVM
+from streamfeat.learn.settings import Setting
 
 RECORDING = Path(__file__).resolve().parents[2] / "recordings" / "digits_train.mcap"
 

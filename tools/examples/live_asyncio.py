@@ -16,10 +16,10 @@ from pathlib import Path
 import zenoh
 
 import streamfeat as sf
-from streamfeat.emission import EmitPolicy
 from streamfeat.live.network import open_session
-from streamfeat.packets import Packet, PacketReader
-from streamfeat.session import Session
+from streamfeat.messages.packets import Packet, PacketReader
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SCHEMA = "event_camera_msgs/msg/EventPacket"

@@ -15,8 +15,8 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from torch.utils.data import DataLoader, Dataset
 
 import streamfeat as sf
-from streamfeat.classifier import normalise_features
-from streamfeat.recording import Sample
+from streamfeat.classify.classifier import normalise_features
+from streamfeat.recordings.reader import Sample
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 

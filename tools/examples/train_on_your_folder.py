@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 import streamfeat as sf
-from streamfeat.classifier import train_classifier
-from streamfeat.features import encode_samples
+from streamfeat.classify.classifier import train_classifier
+from streamfeat.classify.features import encode_samples
 from streamfeat.foreign.datasets import convert
 from streamfeat.learn.fit import learn_encoder
-from streamfeat.learn.setting import Setting
+from streamfeat.learn.settings import Setting
 
 SETTING = Setting(patch=10, stride=4, max_count=2, filters=100, volumes=10_000, iterations=10)
 

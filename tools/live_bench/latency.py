@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
 from streamfeat.events import Events
 from streamfeat.live.names import Attachment, PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.messages import EventPacket
-from streamfeat.packets import Packet, PacketWriter
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.packets import Packet, PacketWriter
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 from tools.live_bench.processes import (
     FRAME,
     KEY,

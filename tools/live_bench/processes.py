@@ -21,8 +21,8 @@ import numpy as np
 import zenoh
 
 from streamfeat.events import Events
-from streamfeat.messages import FeaturesMessage
-from streamfeat.recording import open_recording
+from streamfeat.messages.cdr import FeaturesMessage
+from streamfeat.recordings.reader import open_recording
 
 FRAME = (100, 120)
 """All samples are shown on one sensor of this size."""

@@ -12,8 +12,8 @@ import zenoh
 from streamfeat.live.names import Attachment, PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.messages import EventPacket
-from streamfeat.packets import PacketWriter
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.packets import PacketWriter
 from tools.live_bench.processes import (
     FRAME,
     KEY,

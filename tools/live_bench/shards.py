@@ -8,8 +8,8 @@ from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
-from streamfeat.machine import Disturbance
-from streamfeat.messages import EventPacket
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.report.machine import Disturbance
 from tools.live_bench.processes import FRAME, KEY, counts, cpu_seconds, finish, listener, wait_for_reader
 from tools.live_bench.rates import PACKET, ready_packets
 

@@ -26,9 +26,9 @@ import zenoh
 from streamfeat.live.names import Attachment, PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.machine import Disturbance
-from streamfeat.messages import EventPacket, FeaturesMessage
-from streamfeat.packets import PacketWriter
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage
+from streamfeat.messages.packets import PacketWriter
+from streamfeat.report.machine import Disturbance
 from tools.live_bench.faults import ROUTER
 from tools.live_bench.processes import FRAME, PROGRAM, camera_packets, process, zenoh_config
 from tools.live_bench.spaces import HOST, NotHereError, Two, logged, two_workers

@@ -28,11 +28,11 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from streamfeat.emission import Emission
 from streamfeat.errors import InputError
-from streamfeat.recorder import RecordingWriter, recover
-from streamfeat.recording import Label, Losses, Packet, open_recording
-from streamfeat.replay import Replay
+from streamfeat.recordings.reader import Label, Losses, Packet, open_recording
+from streamfeat.recordings.writer import RecordingWriter, recover
+from streamfeat.stream.emission import Emission
+from streamfeat.stream.replay import ReplayJob
 from tools.torture.table import Row, Trials
 
 __all__ = ["Specimen", "damaged_recordings", "make_specimen", "try_damage"]
@@ -345,7 +345,7 @@ def _check_features(specimen: Specimen, path: Path, whole: Sequence[int], losses
 
 
 def _replay(path: Path, played: _Played) -> Losses:
-    job = Replay(path, MODEL, emit=_EMIT)
+    job = ReplayJob(path, MODEL, emit=_EMIT)
     job.run(more=played)
     return job.losses
 

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.emission import Emission, EmitPolicy
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
 from streamfeat.live.network import open_session
-from streamfeat.pipeline import Pipeline
-from streamfeat.recorder import RecordingWriter
-from streamfeat.recording import open_recording
-from streamfeat.session import Session
-from streamfeat.sinks import JsonLinesSink, RecordingSink
+from streamfeat.recordings.reader import open_recording
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.session import Session
+from streamfeat.stream.sinks import JsonLinesSink, RecordingSink
 from tools.torture.nursery import Nursery, free_port
 from tools.torture.sources import MODEL, ROOT, Camera, digits, folder_of_samples
 from tools.torture.table import Row, Trials

@@ -19,16 +19,16 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from streamfeat.classifier import Classifier
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.classify.classifier import Classifier
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import Events
 from streamfeat.foreign.datasets import convert
 from streamfeat.foreign.event_files import open_events
-from streamfeat.geometry import Geometry
-from streamfeat.messages import EventArray, LabelMessage
-from streamfeat.recorder import RecordingWriter, recover
-from streamfeat.recording import Label, Packet, open_recording
+from streamfeat.messages.cdr import EventArray, LabelMessage
+from streamfeat.recordings.reader import Label, Packet, open_recording
+from streamfeat.recordings.writer import RecordingWriter, recover
 from tools.torture.mutate import mend_mcap, mend_tensors, mend_zip
 from tools.torture.targets import Target, check_events, check_line, some_events
 

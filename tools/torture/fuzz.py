@@ -315,8 +315,9 @@ def _work(name: str, runs: int, seed: int, folder: Path, how: str) -> None:
 
 def let_kernels_read_events() -> None:
     """Compiled kernels read `event.x`; plain Python needs arrays of records for that."""
-    from streamfeat import codecs, engine
+    from streamfeat.engine import engine
     from streamfeat.events import EVENT_DTYPE
+    from streamfeat.messages import codecs
 
     def reading(kernel: Callable[..., Any], *arguments: Any) -> Any:
         return kernel(

@@ -15,11 +15,11 @@ import numpy as np
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from streamfeat.classifier import Classifier
-from streamfeat.encoder import Encoder
+from streamfeat.classify.classifier import Classifier
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.live.network import open_session
-from streamfeat.recording import open_recording
+from streamfeat.recordings.reader import open_recording
 from tools.torture.nursery import Nursery, free_port
 from tools.torture.sources import MODEL, ROOT, TRAIN, Camera, digits, folder_of_samples
 from tools.torture.table import Row, Trials

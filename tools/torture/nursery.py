@@ -21,8 +21,9 @@ __all__ = ["Child", "Nursery", "free_port"]
 _MOTHER = """
 import json, os, sys, traceback
 import numba, numpy, scipy.optimize, sklearn.linear_model, sklearn.model_selection, zenoh
-import streamfeat.cli, streamfeat.classifier, streamfeat.features, streamfeat.foreign.datasets
-import streamfeat.evaluate.run, streamfeat.evaluate.words, streamfeat.learn.fit, streamfeat.live.listen
+import streamfeat.cli, streamfeat.classify.classifier, streamfeat.classify.features
+import streamfeat.foreign.datasets
+import streamfeat.evaluate.run, streamfeat.evaluate.tables, streamfeat.learn.fit, streamfeat.live.listen
 import streamfeat.live.record, tools.torture.state
 
 for line in sys.stdin:

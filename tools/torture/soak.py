@@ -17,16 +17,16 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.codecs import encode
-from streamfeat.emission import Emission, EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
-from streamfeat.geometry import Geometry
-from streamfeat.messages import EventPacket
-from streamfeat.packets import Packet, PacketReader, Tick
-from streamfeat.pipeline import Pipeline
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.codecs import encode
+from streamfeat.messages.packets import Packet, PacketReader, Watermark
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.session import Session
 from tools.torture.table import Row, Trials
 
 __all__ = ["soak"]
@@ -71,7 +71,7 @@ def _encoder(seed: int) -> Encoder:
     )
 
 
-def _stream(packets: int, seed: int) -> Iterator[Packet | Tick]:
+def _stream(packets: int, seed: int) -> Iterator[Packet | Watermark]:
     """Messages of a camera, decoded one after the other, and silences between them."""
     rng = np.random.default_rng(seed)
     height, width = _RESOLUTION
@@ -89,7 +89,7 @@ def _stream(packets: int, seed: int) -> Iterator[Packet | Tick]:
         now_us += _PACKET_US
         if i % 10 == 9:
             if i % 20 == 9:  # in the other silences nobody says that time goes on
-                yield Tick("/events", now_us + 1_000_000)
+                yield Watermark("/events", now_us + 1_000_000)
             now_us += _SILENCE_US
 
 
@@ -119,7 +119,7 @@ class _Watch:
         self._checks = 0
         self._last_us = 0
 
-    def process(self, item: Packet | Tick) -> Iterator[Emission]:
+    def process(self, item: Packet | Watermark) -> Iterator[Emission]:
         """Time what the session does with an item, and look from time to time."""
         cpu, wall = 0.0, 0.0
         readings = self.session.process(item)

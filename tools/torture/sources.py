@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from streamfeat.codecs import encode
 from streamfeat.events import make_events
-from streamfeat.messages import EventPacket
-from streamfeat.packets import Label
-from streamfeat.recorder import RecordingWriter
-from streamfeat.simulate import Saccades, digit_samples
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.codecs import encode
+from streamfeat.messages.packets import Label
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.simulate.saccades import Saccades, digit_samples
 
 __all__ = ["EVENTS_A_FILE", "MODEL", "ROOT", "TRAIN", "Camera", "digits", "folder_of_samples"]
 

@@ -12,18 +12,18 @@ from statistics import median
 
 import numpy as np
 
-from streamfeat.codecs import encode
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.geometry import Geometry
 from streamfeat.events import Events, make_events
-from streamfeat.geometry import Geometry
-from streamfeat.live.listen import Listen
+from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
-from streamfeat.messages import EventPacket
-from streamfeat.packets import Packet
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventPacket
+from streamfeat.messages.codecs import encode
+from streamfeat.messages.packets import Packet
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 from tools.torture.nursery import Nursery, free_port
 from tools.torture.table import Row, Trials
 
@@ -42,7 +42,7 @@ _PATIENCE_S = 120.0
 def listener(words: list[str]) -> None:
     """`streamfeat listen --state`, but that no silence of a busy machine is taken for one of the camera."""
     model, kept, port = words
-    job = Listen(
+    job = ListenJob(
         PlainNames(KEY),
         Path(model),
         emit="10ms",

@@ -16,14 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from streamfeat.cameras import Cameras
-from streamfeat.codecs import ENCODINGS, encode, make_decoder
-from streamfeat.emission import EmitPolicy
-from streamfeat.encoder import Encoder
-from streamfeat.engine import Engine
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
-from streamfeat.geometry import Geometry
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import Intake, Warnings
 from streamfeat.live.names import (
@@ -36,9 +33,12 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
-from streamfeat.messages import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
-from streamfeat.packets import EVENT_SCHEMAS, Packet
-from streamfeat.session import Session
+from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
+from streamfeat.messages.packets import EVENT_SCHEMAS, Packet
+from streamfeat.stream.cameras import Cameras
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 __all__ = [
     "STREAM_TARGETS",
@@ -203,7 +203,7 @@ def _cdr(kind: Any, data: bytes) -> bytes:
 def _cdr_seeds(kind: Any) -> list[bytes]:
     about = (1_234_567_890, "camera")
     if kind is EventPacket:
-        return [_event_packet(encoding) for encoding in ENCODINGS]
+        return [_event_packet(encoding) for encoding in PAYLOAD_ENCODINGS]
     if kind is EventArray:
         return [EventArray(*about, 12, 16, some_events(n)).to_cdr() for n in (0, 1, 2, 20)]
     if kind is LabelMessage:
@@ -275,7 +275,7 @@ def _live_seeds() -> list[bytes]:
         head = _LIVE_HEAD.pack(schema | topic << 2 | 1 << 5, bool(gid), len(payload))
         return head + attachment + payload
 
-    packets = [_event_packet(encoding, seq) for seq, encoding in enumerate(ENCODINGS)]
+    packets = [_event_packet(encoding, seq) for seq, encoding in enumerate(PAYLOAD_ENCODINGS)]
     stream = [put(packet, 0, 0, seq + 1, gids[0]) for seq, packet in enumerate(packets)]
     return [
         b"".join(stream),
@@ -327,7 +327,7 @@ STREAM_TARGETS = [
             170_000,
             kernels=True,
         )
-        for encoding in ENCODINGS
+        for encoding in PAYLOAD_ENCODINGS
     ),
     *(
         Target(

@@ -1,0 +1,371 @@
+"""From features to labels: the frozen linear classifier, and the one that learns online.
+
+Lives here: normalising pooled features, training with cross-validation, saving, predicting, updating.
+Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
+
+Predicting needs NumPy alone; scikit-learn is imported where something is learned, for that takes longer than
+all else before a first prediction.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.errors import InputError
+from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
+
+__all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
+
+FORMAT_VERSION = 1
+
+_KIND = "streamfeat-classifier"
+
+_POWERS = -9, 3
+"""Of ten: the smallest and the largest C that is tried."""
+
+_FIRST_POWER = -5
+"""Where the search for C starts."""
+
+
+def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Signed square root of pooled features, then unit length (Perronnin et al. 2010, section 3.1 and 3.2).
+
+    Args:
+        features: `(n, F)` or `(F,)` float32; not changed.
+
+    Returns:
+        same shape; all zero where the features are.
+    """
+    roots, length = _roots(features)
+    return np.asarray(roots / length, np.float32)
+
+
+def _roots(features: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Signed square roots, and the length of each row of them; one where a row is zero."""
+    size = np.abs(features)
+    # The squares of the roots add up to the sizes.
+    length = np.sqrt(size.sum(axis=-1, keepdims=True))
+    np.sqrt(size, out=size)
+    return np.copysign(size, features, out=size), np.where(length > 0, length, np.float32(1))
+
+
+@dataclass(frozen=True, slots=True)
+class Classifier:
+    """A frozen linear classifier over the features of one encoder.
+
+    Attributes:
+        labels: names of the classes.
+        centre: `(F,)` float32, mean of the normalised features in training.
+        scale: `(F,)` float32, their standard deviation, never zero.
+        weights: `(F, C)` float32, or `(F, 1)` for two classes, in favour of the second.
+        bias: `(C,)` or `(1,)` float32.
+        fingerprint: of the encoder it was trained with.
+        provenance: how it was trained (JSON values).
+    """
+
+    labels: tuple[str, ...]
+    centre: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    fingerprint: str
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    _folded: NDArray[np.float32] = field(init=False, repr=False, compare=False)
+    _folded_bias: NDArray[np.float32] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Fold standardisation into the weights."""
+        folded = self.weights / self.scale[:, np.newaxis]
+        object.__setattr__(self, "_folded", folded)
+        object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
+
+    @classmethod
+    def untrained(cls, labels: Sequence[str], encoder: FeatureMap) -> Self:
+        """A classifier of zeros, for learning online from nothing.
+
+        Raises:
+            InputError: there are fewer than two labels.
+        """
+        names = tuple(sorted(set(labels)))
+        if len(names) < 2:
+            raise InputError(f"{len(names)} label is not enough to classify; at least two are needed")
+        n, columns = encoder.n_features, 1 if len(names) == 2 else len(names)
+        return cls(
+            labels=names,
+            centre=np.zeros(n, np.float32),
+            scale=np.full(n, 1 / np.sqrt(n), np.float32),
+            weights=np.zeros((n, columns), np.float32),
+            bias=np.zeros(columns, np.float32),
+            fingerprint=encoder.fingerprint,
+        )
+
+    def prepare(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Normalise and standardise features `(F,)` or `(n, F)`, as the weights expect them."""
+        return (normalise_features(features) - self.centre) / self.scale
+
+    def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Score of every label: `(C,)` for features `(F,)`, `(n, C)` for `(n, F)`."""
+        # As `prepare(features) @ weights + bias`, with all that does not depend on the features worked out.
+        roots, length = _roots(features)
+        # Row by row: a product of matrices would have other last bits for another number of rows.
+        products = [row @ self._folded for row in roots.reshape(-1, roots.shape[-1])]
+        totals = np.reshape(products, (*features.shape[:-1], len(self.bias)))
+        return _spread(totals / length + self._folded_bias)
+
+    def predict(self, features: NDArray[np.float32]) -> str:
+        """The label with the highest score for features `(F,)`."""
+        return self.labels[int(self.scores(features).argmax())]
+
+    def check_fits(self, encoder: Encoder, *, path: str | Path = "the classifier") -> None:
+        """Refuse an encoder other than the one it was trained with.
+
+        Raises:
+            InputError: they do not belong together.
+        """
+        if len(self.centre) != encoder.n_features:
+            raise InputError(
+                f"{path}: expects {len(self.centre)} features, the model gives {encoder.n_features}; "
+                "train it with this model"
+            )
+        if self.fingerprint != encoder.fingerprint:
+            raise InputError(f"{path}: was trained with another model; train it with this one")
+
+    def save(self, path: str | Path) -> None:
+        """Write one safetensors file; the file appears whole or not at all."""
+        arrays = {name: getattr(self, name) for name in ("centre", "scale", "weights", "bias")}
+        header = {
+            "labels": list(self.labels),
+            "fingerprint": self.fingerprint,
+            "provenance": dict(self.provenance),
+        }
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a classifier; every shape, type and range is checked, and nothing in the file is run.
+
+        Raises:
+            InputError: the file is missing, cut short, of another version, or not a classifier.
+        """
+        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        fingerprint, provenance = header.get("fingerprint"), header.get("provenance", {})
+        labels = header["labels"] if isinstance(header.get("labels"), list) else []
+        sound = all(isinstance(name, str) for name in labels) and len(set(labels)) == len(labels) >= 2
+        if not (sound and isinstance(fingerprint, str) and isinstance(provenance, dict)):
+            raise InputError(f"{path}: labels, fingerprint or provenance are missing; train it again")
+        columns = 1 if len(labels) == 2 else len(labels)
+        n = arrays["centre"].size if "centre" in arrays else 0
+        shapes = {"centre": (n,), "scale": (n,), "weights": (n, columns), "bias": (columns,)}
+        for name, shape in shapes.items():
+            array = arrays.get(name)
+            if array is None or array.dtype != np.float32 or array.shape != shape:
+                raise InputError(f"{path}: {name} is not float32 of shape {shape}; train it again")
+            if not np.isfinite(array).all():
+                raise InputError(f"{path}: {name} is not finite; train it again")
+        if n == 0 or not (arrays["scale"] > 0).all():
+            raise InputError(f"{path}: scale must be above zero; train it again")
+        with np.errstate(over="ignore", invalid="ignore"):
+            loaded = cls(
+                labels=tuple(labels),
+                **{name: arrays[name] for name in shapes},
+                fingerprint=fingerprint,
+                provenance=provenance,
+            )
+            # No score can be larger than this: normalised features have unit length.
+            largest = np.abs(loaded._folded).sum(axis=0) + np.abs(loaded._folded_bias)
+        if not np.isfinite(largest).all():
+            raise InputError(f"{path}: scores would not be finite; train it again")
+        return loaded
+
+
+def train_classifier(
+    features: NDArray[np.float32],
+    labels: Sequence[str],
+    encoder: FeatureMap,
+    *,
+    groups: ArrayLike | None = None,
+    candidates: Sequence[float] | None = None,
+    folds: int = 3,
+    seed: int = 0,
+    provenance: Mapping[str, Any] | None = None,
+) -> Classifier:
+    """Train a linear SVM; its regularisation is chosen by stratified cross-validation.
+
+    Args:
+        features: `(n, F)` float32, as `Encoder.encode` gives them; not changed.
+        labels: `n` names.
+        encoder: that made the features.
+        groups: `n` integers; samples of one group are never on two sides of a fold, as those that were made
+            from one another. Every sample is a group if not given.
+        candidates: values of C to choose from; the scale is that of standardised features. If not given,
+            powers of ten, as many as it takes for the best to have neighbours on both sides.
+        folds: of the cross-validation.
+        seed: of the folds.
+        provenance: JSON values kept with the classifier; scores are added.
+
+    Raises:
+        InputError: labels are missing, fewer than two classes, or a class with fewer samples than folds.
+    """
+    from sklearn.model_selection import StratifiedGroupKFold
+    from sklearn.preprocessing import StandardScaler
+
+    from streamfeat.classify.svm import LinearSVM
+
+    missing = [i for i, label in enumerate(labels) if not (isinstance(label, str) and label)]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(labels)} training samples have no label, the first is sample "
+            f"{missing[0]}; label them or leave them out"
+        )
+    targets = np.asarray(labels)
+    group = np.arange(len(targets)) if groups is None else np.asarray(groups)
+    names, counts = np.unique(targets[np.unique(group, return_index=True)[1]], return_counts=True)
+    if len(names) < 2:
+        raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")
+    if folds < 2:
+        raise InputError(f"cross-validation with {folds} folds is not possible; it needs at least two")
+    if counts.min() < folds:
+        raise InputError(
+            f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
+            f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
+        )
+    rows = normalise_features(features)
+    splitter = StratifiedGroupKFold(folds, shuffle=True, random_state=seed)
+    parts = [
+        (train, test, StandardScaler().fit(rows[train]), LinearSVM(warm_start=True))
+        for train, test in splitter.split(rows, targets, group)
+    ]
+
+    def score(c: float) -> float:
+        right = 0
+        for train, test, fold_scaler, svm in parts:
+            svm.set_params(C=c).fit(fold_scaler.transform(rows[train]), targets[train])
+            right += int(np.sum(svm.predict(fold_scaler.transform(rows[test])) == targets[test]))
+        return right / len(targets)
+
+    scores = {c: score(c) for c in candidates} if candidates else _climb(score, len(targets))
+    best = max(scores, key=lambda c: (scores[c], -c))
+    scaler = StandardScaler(copy=False)
+    svm = LinearSVM(C=best).fit(scaler.fit_transform(rows), targets)
+    return Classifier(
+        labels=tuple(str(name) for name in svm.classes_),
+        centre=scaler.mean_.astype(np.float32),
+        scale=scaler.scale_.astype(np.float32),
+        weights=svm.coef_.T.astype(np.float32),
+        bias=svm.intercept_.astype(np.float32),
+        fingerprint=encoder.fingerprint,
+        provenance={
+            **(provenance or {}),
+            "C": best,
+            "cross_validation": {str(c): round(scores[c], 4) for c in sorted(scores)},
+            "samples": len(labels),
+        },
+    )
+
+
+def _climb(score: Callable[[float], float], n: int) -> dict[float, float]:
+    """Accuracy for powers of ten as C: up from a small one until it falls, then down if the first was best.
+
+    A large C takes much longer than a small one, and no more than what is needed to see that it is too large
+    is spent on it: one that is a standard error below the best is the last, as is the second in a row that is
+    not better.
+
+    Args:
+        score: cross-validated accuracy for a value of C; called along growing, then falling ones.
+        n: samples.
+    """
+    found: dict[int, float] = {}
+    best = _FIRST_POWER
+    for power in range(_FIRST_POWER, _POWERS[1] + 1):
+        found[power] = score(10.0**power)
+        best = max(found, key=lambda p: (found[p], -p))
+        error = np.sqrt(found[best] * (1 - found[best]) / n)
+        if power - best == 2 or found[power] < found[best] - error:
+            break
+    while best == min(found) > _POWERS[0]:
+        found[best - 1] = score(10.0 ** (best - 1))
+        best = max(found, key=lambda p: (found[p], -p))
+    return {10.0**power: value for power, value in found.items()}
+
+
+class OnlineClassifier:
+    """A linear classifier that goes on learning: passive-aggressive steps over scikit-learn's `partial_fit`.
+
+    One step for one sample costs milliseconds in scikit-learn, a batch hardly more: samples are collected
+    and learned `batch_size` at a time. Predictions come from the weights of the last batch.
+
+    Args:
+        start: where to begin; its normalisation stays as it is.
+        rate: largest step for one sample (PA-I's C, Crammer et al. 2006).
+        batch_size: samples to collect before a step.
+        seed: of scikit-learn's shuffling.
+    """
+
+    def __init__(self, start: Classifier, *, rate: float = 0.01, batch_size: int = 16, seed: int = 0) -> None:
+        """Start from the weights of `start`."""
+        from sklearn.linear_model import SGDClassifier
+
+        self.classifier = start
+        self.batch_size = batch_size
+        self.learned = 0
+        self._pending: list[tuple[NDArray[np.float32], int]] = []
+        self._model = SGDClassifier(
+            loss="hinge", penalty=None, learning_rate="pa1", eta0=rate, random_state=seed
+        )
+        # The first call only makes scikit-learn allocate; its weights are replaced at once.
+        classes = np.arange(len(start.labels))
+        self._model.partial_fit(np.zeros((len(classes), len(start.centre))), classes, classes=classes)
+        # Its loops take contiguous rows of float64 only.
+        self._model.coef_ = np.ascontiguousarray(start.weights.T, np.float64)
+        self._model.intercept_ = start.bias.astype(np.float64)
+
+    def predict_one(self, features: NDArray[np.float32]) -> str:
+        """The label for features `(F,)`, before anything is learned from them."""
+        return self.classifier.predict(features)
+
+    def learn_one(self, features: NDArray[np.float32], label: str) -> None:
+        """Take in one labelled sample.
+
+        Args:
+            features: `(F,)` float32; copied.
+            label: one of `classifier.labels`.
+
+        Raises:
+            InputError: the label is unknown.
+        """
+        if label not in self.classifier.labels:
+            known = ", ".join(self.classifier.labels)
+            raise InputError(f"label {label!r} is not one of the classifier's labels: {known}")
+        self._pending.append((self.classifier.prepare(features), self.classifier.labels.index(label)))
+        if len(self._pending) >= self.batch_size:
+            self.flush()
+
+    def flush(self) -> None:
+        """Learn what has been collected."""
+        if not self._pending:
+            return
+        rows, targets = zip(*self._pending, strict=True)
+        self._pending.clear()
+        self._model.partial_fit(np.stack(rows).astype(np.float64), np.array(targets))
+        self.learned += len(targets)
+        old = self.classifier
+        self.classifier = Classifier(
+            labels=old.labels,
+            centre=old.centre,
+            scale=old.scale,
+            weights=self._model.coef_.T.astype(np.float32),
+            bias=self._model.intercept_.astype(np.float32),
+            fingerprint=old.fingerprint,
+            provenance={**old.provenance, "learned_online": self.learned},
+        )
+
+
+def _spread(scores: ArrayLike) -> NDArray[np.float32]:
+    """One score for each label: the single score of two classes counts for the one, against the other."""
+    values = np.asarray(scores, np.float32)
+    return np.concatenate([-values, values], axis=-1) if values.shape[-1] == 1 else values

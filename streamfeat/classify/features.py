@@ -1,0 +1,221 @@
+"""Features of many samples at once, for training and evaluation.
+
+Lives here: `EventFeatures`, the scikit-learn transformer; encoding samples on all cores; mirrored samples.
+Not here: streams (`engine`), and what one window's features are (`window`).
+"""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+
+from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.errors import InputError
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Losses, Recording, Sample
+from streamfeat.work.workers import THIS_PROCESS, Workers
+
+__all__ = [
+    "EncodedSamples",
+    "EventFeatures",
+    "encode_recordings",
+    "encode_samples",
+    "mirrored",
+    "sample_end",
+    "training_set",
+]
+
+
+def sample_end(label: Label) -> int:
+    """The last microsecond of a labelled sample: its features are read there."""
+    return label.start_us + label.duration_us - 1
+
+
+def encode_samples(
+    encoder: FeatureMap, samples: Iterable[Sample], *, threads: int | None = None
+) -> Iterator[tuple[Label, NDArray[np.float32]]]:
+    """Encode labelled samples on several threads; kernels release the GIL.
+
+    Args:
+        encoder: the frozen encoder.
+        samples: read one at a time, a few ahead of what has been yielded.
+        threads: how many; as many as there are cores if not given.
+
+    Yields:
+        label and `(n_features,)` float32, in order.
+    """
+    n = threads or os.cpu_count() or 1
+
+    def encode(sample: Sample) -> tuple[Label, NDArray[np.float32]]:
+        origin, end = sample.label.start_us, sample_end(sample.label)
+        return sample.label, encoder.encode(sample.events, sample.resolution, origin_us=origin, t_us=end)
+
+    source = iter(samples)
+    with ThreadPoolExecutor(n, thread_name_prefix="encode") as pool:
+        ahead: deque[Future[tuple[Label, NDArray[np.float32]]]] = deque(
+            pool.submit(encode, sample) for sample in islice(source, 2 * n)
+        )
+        while ahead:
+            yield ahead.popleft().result()
+            ahead.extend(pool.submit(encode, sample) for sample in islice(source, 1))
+
+
+def mirrored(sample: Sample) -> Sample:
+    """The sample as it would look in a mirror: columns from right to left.
+
+    An event outside the sensor stays outside: `x` is unsigned and wraps.
+    """
+    events = sample.events.copy()
+    events["x"] = np.uint16(sample.resolution[1] - 1) - events["x"]
+    return replace(sample, events=events)
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedSamples:
+    """Features of labelled samples in the order of the stream.
+
+    Attributes:
+        rows: `(n, F)` float32.
+        labels: `(n,)` names.
+        held_out: `(n,)` bool, whether a sample is of a held-out split.
+    """
+
+    rows: NDArray[np.float32]
+    labels: NDArray[np.str_]
+    held_out: NDArray[np.bool_]
+
+
+def encode_recordings(
+    encoder: FeatureMap,
+    recordings: Sequence[Recording],
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
+    *,
+    mirror: bool = False,
+    workers: Workers = THIS_PROCESS,
+) -> EncodedSamples:
+    """Encode all labelled samples of recordings, or the mirror images of those that are not held out.
+
+    Args:
+        encoder: the frozen encoder.
+        recordings: open recordings.
+        report: called with (step, done, of how many, remark).
+        mirror: encode mirror images, of training samples only.
+        workers: read and encode.
+    """
+    labels: list[Label] = []
+    rows: list[NDArray[np.float32]] = []
+    step = "encoding mirrored" if mirror else "encoding"
+    for recording in recordings:
+        losses, parts = Losses(), [(recording.part(part),) for part in recording.parts()]
+        found = workers.map(_encode_part, parts, workers.hold(encoder), mirror)
+        for done, (names, encoded, lost) in enumerate(found, 1):
+            labels += names
+            rows.append(encoded)
+            losses.add_all(lost)
+            report(step, done, len(parts), f"{recording.path.name}, {len(labels):,} samples")
+        recording.losses = losses
+    return EncodedSamples(
+        np.concatenate(rows) if rows else np.empty((0, encoder.n_features), np.float32),
+        np.array([label.label for label in labels], str),
+        np.array([label.split in HELD_OUT_SPLITS for label in labels], bool),
+    )
+
+
+def _encode_part(
+    opener: Callable[[], Recording], encoder: FeatureMap, mirror: bool
+) -> tuple[list[Label], NDArray[np.float32], Losses]:
+    with opener() as recording:
+        samples = recording.samples()
+        if mirror:
+            samples = (mirrored(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
+        encoded = [*encode_samples(encoder, samples, threads=1)]
+        rows = np.empty((len(encoded), encoder.n_features), np.float32)
+        for row, (_, features) in zip(rows, encoded, strict=True):
+            row[:] = features
+        return [label for label, _ in encoded], rows, recording.losses
+
+
+def training_set(
+    samples: EncodedSamples, images: EncodedSamples | None
+) -> tuple[NDArray[np.float32], list[str], NDArray[np.int64]]:
+    """What a classifier is trained on: rows, labels, and the number of the sample that each is made of.
+
+    Args:
+        samples: of which those that are not held out are taken.
+        images: mirror images of just those, if they are to be learned from as well.
+    """
+    seen = ~samples.held_out
+    rows, labels = samples.rows[seen], samples.labels[seen].tolist()
+    numbers = np.arange(len(rows))
+    if images is None:
+        return rows, labels, numbers
+    return np.concatenate([rows, images.rows]), 2 * labels, np.tile(numbers, 2)
+
+
+class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Turn labelled samples into features, as a step of a scikit-learn `Pipeline`.
+
+    Stateless: the encoder is learned beforehand, without labels. `set_output(transform="pandas")` makes its
+    output a data frame, as everywhere in scikit-learn.
+
+    Args:
+        encoder: the frozen encoder.
+        threads: how many encode at once; as many as there are cores if not given.
+    """
+
+    def __init__(self, encoder: Encoder, threads: int | None = None) -> None:
+        """Keep the parameters."""
+        self.encoder = encoder
+        self.threads = threads
+
+    def fit(self, X: Any, y: Any = None) -> Self:
+        """Do nothing; the encoder is frozen."""
+        return self
+
+    def transform(self, X: Iterable[Sample]) -> NDArray[np.float32]:
+        """Features `(n, n_features)` float32 of `n` samples, such as `list(recording.samples())`.
+
+        Raises:
+            InputError: one of them is not a sample.
+        """
+        rows = [features for _, features in encode_samples(self.encoder, _checked(X), threads=self.threads)]
+        return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
+        """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
+
+        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`.
+
+        Args:
+            input_features: samples have no features of their own, so it is ignored.
+        """
+        halves = ("_pos", "_neg") if self.encoder.encoding == "split" else ("",)
+        cells = range(self.encoder.geometry.pooling)
+        names = [
+            f"cell_{row}_{column}_{k}{half}"
+            for row in cells
+            for column in cells
+            for half in halves
+            for k in range(self.encoder.n_filters)
+        ]
+        return np.array(names, object)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        """Say that there is nothing to fit."""
+        return True
+
+
+def _checked(samples: Iterable[Any]) -> Iterator[Sample]:
+    for i, sample in enumerate(samples):
+        if not isinstance(sample, Sample):
+            raise InputError(
+                f"sample {i} is of type {type(sample).__name__}; "
+                "give labelled samples, such as list(recording.samples())"
+            )
+        yield sample

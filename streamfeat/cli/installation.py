@@ -1,0 +1,212 @@
+"""What this installation is, what it lacks, and whether it computes what it should, how fast.
+
+Lives here: versions against what the package asks for, extras, threads, kernels, a second of work.
+Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
+"""
+
+import os
+import re
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
+from streamfeat.events import Events
+from streamfeat.kernels.ingest import count_events
+from streamfeat.report.machine import Disturbance, describe_machine
+from streamfeat.simulate.saccades import CameraModel, digit_samples
+
+__all__ = ["EXTRAS", "examine"]
+
+EXTRAS = {
+    "cluster": "work on other processes and machines",
+    "convert": "Prophesee HDF5 files",
+    "export": "Arrow, Parquet and pandas",
+    "plot": "pages and pictures of results",
+    "store": "recordings by URL",
+    "view": "Foxglove",
+    "bench": "peers in tools/bench",
+    "fuzz": "guided inputs in tools/torture",
+    "test": "the tests",
+    "lint": "lint and types",
+}
+"""What each extra is for."""
+
+_VECTORS = ("sse4.2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "neon", "sve")
+_FILTERS = 400
+_SAMPLE_US = 1_000_000
+
+
+def examine(progress: Callable[[str], None] = lambda step: None, *, seconds: float = 1.0) -> dict[str, Any]:
+    """Look at everything; compiles kernels where that has not been done yet.
+
+    Args:
+        progress: told what comes next.
+        seconds: of work in the speed check.
+
+    Returns:
+        JSON values; `problems` has a line for each thing that keeps streamfeat from working as it should.
+    """
+    progress("versions")
+    required, extras = _requirements()
+    problems = [
+        f"{name} {found or 'is missing'}, wanted {wanted}: pip install --upgrade streamfeat"
+        for name, (found, wanted) in required.items()
+        if not _satisfies(found, wanted)
+    ]
+    features = [name for name, there in llvm.get_host_cpu_features().items() if there]
+    report: dict[str, Any] = {
+        "machine": describe_machine() | {"target": llvm.get_host_cpu_name()},
+        "cpu_features": sorted(features),
+        "vectors": [name for name in _VECTORS if name in features],
+        "threads": _threads(),
+        "required": {
+            name: {"installed": found, "wanted": wanted} for name, (found, wanted) in required.items()
+        },
+        "extras": {
+            extra: {
+                "for": EXTRAS.get(extra, ""),
+                "missing": [
+                    name + (f" {wanted}, not {found}" if found else "")
+                    for name, (found, wanted) in parts.items()
+                    if not _satisfies(found, wanted)
+                ],
+            }
+            for extra, parts in extras.items()
+        },
+    }
+    report |= _work(progress, seconds)
+    if not report["kernels"]["cached"]:
+        problems.append(
+            f"compiled kernels cannot be kept in {report['kernels']['folder']}, so every start compiles them "
+            "again: set NUMBA_CACHE_DIR to a folder that can be written to"
+        )
+    if not report["exact"]:
+        problems.append(
+            "features of the stream differ from those computed offline: please report this machine"
+        )
+    return report | {"problems": problems}
+
+
+def _threads() -> dict[str, Any]:
+    """How many numba uses, and through which library; asking how many starts them."""
+    n = numba.get_num_threads()
+    return {"numba": n, "layer": numba.threading_layer()}  # type: ignore[attr-defined]
+
+
+def _requirements() -> tuple[dict[str, tuple[str, str]], dict[str, dict[str, tuple[str, str]]]]:
+    """Installed version ("" for none) and wanted range of each dependency; the same for each extra."""
+    required: dict[str, tuple[str, str]] = {}
+    extras: dict[str, dict[str, tuple[str, str]]] = {}
+    for line in requires("streamfeat") or []:
+        requirement, _, condition = line.partition(";")
+        match = re.match(r"\s*([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*(.*)", requirement)
+        extra = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", condition)
+        if not match:
+            continue
+        name, wanted = match[1], match[2].strip(" ()")
+        place = extras.setdefault(extra[1], {}) if extra else required
+        place[name] = _installed(name), wanted
+    return required, extras
+
+
+def _installed(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+def _satisfies(found: str, wanted: str) -> bool:
+    """Whether a version is inside bounds such as `>=2.0,<3`; only the bounds that we use ourselves."""
+    if not found:
+        return False
+    for bound in filter(None, wanted.split(",")):
+        limit, mine = _numbers(bound), _numbers(found)
+        length = max(len(limit), len(mine))  # 2 is 2.0
+        limit, mine = (numbers + [0] * (length - len(numbers)) for numbers in (limit, mine))
+        if (mine < limit) if bound.strip().startswith(">=") else (mine >= limit):
+            return False
+    return True
+
+
+def _numbers(text: str) -> list[int]:
+    release = re.search(r"\d+(?:\.\d+)*", text)
+    return [int(part) for part in release[0].split(".")] if release else []
+
+
+def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:
+    """Encode simulated digits both ways; then as many events as fit into the time."""
+    progress("compiling kernels, if this is the first time")
+    encoder, events, resolution = _random_encoder(), _digit_events(), CameraModel().resolution
+    started = time.perf_counter()
+    feeding, following = Engine(encoder, resolution), Engine(encoder, resolution)
+    feeding.feed(events)
+    following.follow(events)
+    offline = encoder.encode(events, resolution, origin_us=0)
+    compiled = time.perf_counter() - started
+    exact = all(np.array_equal(engine.features(), offline) for engine in (feeding, following))
+    progress("a second of work")
+    disturbance = Disturbance()
+    fed = _events_per_second(feeding.feed, events, 0.3 * seconds, size=len(events))
+    followed = _events_per_second(following.follow, events, 0.7 * seconds, size=200)
+    return {
+        "kernels": _kernel_cache() | {"first_use_s": round(compiled, 2)},
+        "exact": exact,
+        "speed": {
+            "events_per_s": round(fed),
+            "event_us": round(1e6 / followed, 2),
+            "filters": encoder.n_filters,
+            "taken_by_others": disturbance.steal_share(),
+        },
+    }
+
+
+def _kernel_cache() -> dict[str, Any]:
+    folder = Path(count_events.stats.cache_path or "")
+    kept = bool(count_events.stats.cache_path) and os.access(folder, os.W_OK)
+    return {"folder": str(folder), "cached": kept}
+
+
+def _events_per_second(take: Callable[[Events], None], events: Events, seconds: float, *, size: int) -> float:
+    """Take batches of `size` for some seconds of the clock; stream time goes on at each round."""
+    n, events = 0, events.copy()
+    started = time.perf_counter()
+    while True:
+        events["t"] += _SAMPLE_US
+        for start in range(0, len(events), size):
+            batch = events[start : start + size]
+            take(batch)
+            n += len(batch)
+            if (spent := time.perf_counter() - started) >= seconds:
+                return n / spent
+
+
+def _digit_events() -> Events:
+    return next(iter(digit_samples(1, 0))).events
+
+
+def _random_encoder() -> Encoder:
+    """The default geometry of `streamfeat learn`, with filters that need no learning."""
+    geometry, rng = (
+        Geometry(patch=12, stride=4, n_bins=3, bin_us=100_000, max_count=1),
+        np.random.default_rng(0),
+    )
+    filters = rng.standard_normal((_FILTERS, geometry.entries))
+    return Encoder.build(
+        geometry,
+        formulation="direct",
+        encoding="split",
+        threshold=0.3,
+        filters=filters / np.linalg.norm(filters, axis=1, keepdims=True),
+        whitening=np.eye(geometry.entries),
+        mean=np.zeros(geometry.entries),
+    )

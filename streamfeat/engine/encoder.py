@@ -1,0 +1,285 @@
+"""The frozen encoder: geometry, learned matrices, and the integers that make streaming exact.
+
+Lives here: how an encoder is made, checked, saved, loaded, and applied to one whole window (offline).
+Not here: learning the matrices (`learn`), and anything that changes as events come (`engine`).
+"""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.operator import check_operator, fixed_fields, n_features, quantise
+from streamfeat.engine.window import encode_window
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution, as_events
+from streamfeat.files.safetensors_file import one_line, read_safetensors, write_safetensors
+from streamfeat.kernels.layout import FEATURE_ENCODINGS, Operator
+
+__all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
+
+FORMAT_VERSION = 1
+
+_KIND = "streamfeat-encoder"
+
+Formulation = Literal["direct", "inverse"]
+Encoding = Literal["soft", "split", "triangle"]
+
+_MOST_ATOMS = 1 << 12  # their products with each other take 128 MiB while they are made
+_LARGEST = 1e8  # of any parameter, so that no product of three and d^2 of them overflows a float32
+
+
+class FeatureMap(Protocol):
+    """What turns the events of one window into features: an encoder, or what it is compared with."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Of everything that decides what features are."""
+
+    @property
+    def n_features(self) -> int:
+        """Length of a feature vector."""
+
+    def encode(
+        self,
+        events: Events,
+        resolution: Resolution,
+        *,
+        origin_us: int | None = None,
+        t_us: int | None = None,
+    ) -> NDArray[np.float32]:
+        """Features of one window; see `Encoder.encode`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """A learned, frozen map from the counts of a window to features.
+
+    Make one with `Encoder.build` or `Encoder.load`; the fields are not to be changed.
+
+    Attributes:
+        geometry: of the local volumes.
+        formulation: `direct` (rows of `filters` are those of `A`) or `inverse` (columns of `D`).
+        encoding: what is pooled.
+        threshold: the sparsity penalty lambda0.
+        filters: `(K, d)` float32.
+        whitening: `(d, d)` float32, `W`.
+        mean: `(d,)` float32, `mu`.
+        operator: the integers applied online; for kernels.
+        provenance: how it was learned (JSON values).
+    """
+
+    geometry: Geometry
+    formulation: Formulation
+    encoding: Encoding
+    threshold: float
+    filters: NDArray[np.float32]
+    whitening: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    operator: Operator
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def build(
+        cls,
+        geometry: Geometry,
+        *,
+        formulation: Formulation,
+        encoding: Encoding,
+        threshold: float,
+        filters: NDArray[np.floating[Any]],
+        whitening: NDArray[np.floating[Any]],
+        mean: NDArray[np.floating[Any]],
+        eps: float = 0.01,
+        gap: float = 1e-6,
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Fold whitening and mean removal into one operator and quantise it.
+
+        One scale serves all filters: an entry of the operator is off by at most `max |P| / 65534`, so a
+        code is off by about 1e-5 of the largest, and no array of scales walks through the hot loop.
+
+        Args:
+            geometry: of the local volumes, `d` entries each.
+            formulation: which problem the filters solve.
+            encoding: what is pooled.
+            threshold: lambda0, above zero for `inverse`.
+            filters: `(K, d)`, rows of `A` or columns of `D`.
+            whitening: `(d, d)`, `W`.
+            mean: `(d,)`, `mu`.
+            eps: added to the variance of a volume.
+            gap: relative duality gap at which the lasso stops (inverse formulation).
+            provenance: JSON values kept with the model.
+
+        Raises:
+            InputError: shapes do not fit, a value is not finite, or an integer could overflow.
+        """
+        filters32 = np.array(filters, np.float32, order="C")  # copies, because they are made read-only
+        whitening32 = np.array(whitening, np.float32, order="C")
+        mean32 = np.array(mean, np.float32, order="C")
+        _check_parameters(geometry, formulation, encoding, threshold, filters32, whitening32, mean32)
+        fixed = fixed_fields(geometry, formulation, encoding, threshold, filters32)
+        operator = quantise(geometry, fixed, filters32, whitening32, mean32, eps, gap)
+        return cls._checked(
+            geometry=geometry,
+            formulation=formulation,
+            encoding=encoding,
+            threshold=float(threshold),
+            filters=filters32,
+            whitening=whitening32,
+            mean=mean32,
+            operator=operator,
+            provenance=dict(provenance or {}),
+        )
+
+    @classmethod
+    def _checked(cls, **fields: Any) -> Self:
+        fields["operator"] = check_operator(fields["geometry"], fields["operator"])
+        encoder = cls(**fields)
+        for array in (encoder.filters, encoder.whitening, encoder.mean, *encoder.operator):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+        return encoder
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over everything that decides what features are."""
+        digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
+        for value in self.operator:
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return digest.hexdigest()
+
+    @property
+    def n_filters(self) -> int:
+        """Number of filters or atoms, `K`."""
+        return self.operator.n_filters
+
+    @property
+    def n_features(self) -> int:
+        """Length of a feature vector: `K` for each cell, or `2 K` for `split`."""
+        return n_features(self.operator)
+
+    def encode(
+        self,
+        events: Events,
+        resolution: Resolution,
+        *,
+        origin_us: int | None = None,
+        t_us: int | None = None,
+    ) -> NDArray[np.float32]:
+        """Features of one window, computed from all of its events at once (the offline path).
+
+        Has the bits of an `Engine` with the same origin that was fed the same events and advanced to
+        `t_us` (inverse formulation: both are within the duality gap).
+
+        Args:
+            events: `(n,)` EVENT_DTYPE in any order, or a structured array of another tool (see `as_events`);
+                those outside the sensor or the window are ignored.
+            resolution: `(height, width)` of the sensor.
+            origin_us: start of bin 0; the time of the first event if not given.
+            t_us: a time in the last bin of the window; the time of the last event if not given.
+
+        Returns:
+            `(n_features,)` float32.
+
+        Raises:
+            InputError: `events` are no events.
+        """
+        events = as_events(events)
+        return encode_window(self.geometry, self.operator, events, resolution, origin_us, t_us)
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as one safetensors file; the file appears whole or not at all."""
+        operator = self.operator
+        arrays = {"filters": self.filters, "whitening": self.whitening, "mean": self.mean}
+        arrays |= {name: getattr(operator, name) for name in _STORED_ARRAYS}
+        header = {
+            "geometry": dataclasses.asdict(self.geometry),
+            "formulation": self.formulation,
+            "encoding": self.encoding,
+            "threshold": self.threshold,
+            "scalars": {name: getattr(operator, name) for name in _STORED_SCALARS},
+            "provenance": dict(self.provenance),
+        }
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a model. Every shape, type and range is checked, and nothing in the file is run.
+
+        Raises:
+            InputError: the file is missing, cut short, of another version, or not a model.
+        """
+        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        try:
+            return cls._from_parts(arrays, header)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise InputError(f"{path}: not a usable model: {one_line(error)}; learn it again") from error
+
+    @classmethod
+    def _from_parts(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> Self:
+        geometry = Geometry(**header["geometry"])
+        formulation, encoding = header["formulation"], header["encoding"]
+        threshold = float(header["threshold"])
+        filters, whitening, mean = (arrays[name] for name in ("filters", "whitening", "mean"))
+        _check_parameters(geometry, formulation, encoding, threshold, filters, whitening, mean)
+        scalars = {name: float(header["scalars"][name]) for name in _STORED_SCALARS}
+        if not all(math.isfinite(value) for value in scalars.values()):
+            raise InputError("a scalar is not finite")
+        fields = fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
+        operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in _STORED_ARRAYS})
+        provenance = header.get("provenance", {})
+        if not isinstance(provenance, dict):
+            raise InputError("provenance is not a JSON object")
+        return cls._checked(
+            geometry=geometry,
+            formulation=formulation,
+            encoding=encoding,
+            threshold=threshold,
+            filters=filters,
+            whitening=whitening,
+            mean=mean,
+            operator=operator,
+            provenance=provenance,
+        )
+
+
+_STORED_ARRAYS = ("columns", "offset", "quadratic", "linear", "square_norms")
+_STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "reach", "gap")
+
+
+def _check_parameters(
+    geometry: Geometry,
+    formulation: str,
+    encoding: str,
+    threshold: float,
+    filters: NDArray[np.float32],
+    whitening: NDArray[np.float32],
+    mean: NDArray[np.float32],
+) -> None:
+    d = geometry.entries
+    if formulation not in ("direct", "inverse"):
+        raise InputError(f"formulation is {formulation!r}, it must be 'direct' or 'inverse'")
+    if encoding not in FEATURE_ENCODINGS:
+        raise InputError(f"encoding is {encoding!r}, it must be one of {', '.join(FEATURE_ENCODINGS)}")
+    if not 0 <= threshold <= _LARGEST or (formulation == "inverse" and threshold == 0):
+        raise InputError(f"threshold is {threshold}, it must be above zero and at most {_LARGEST:g}")
+    if formulation == "inverse" and filters.ndim == 2 and len(filters) > _MOST_ATOMS:
+        raise InputError(
+            f"{len(filters)} atoms are too many, their products are kept for at most {_MOST_ATOMS}"
+        )
+    if filters.ndim != 2 or filters.shape[0] < 1 or filters.shape[1] != d:
+        raise InputError(f"filters have shape {filters.shape}, expected (K, {d})")
+    for name, array, shape in (("whitening", whitening, (d, d)), ("mean", mean, (d,))):
+        if array.shape != shape:
+            raise InputError(f"{name} has shape {array.shape}, expected {shape}")
+    for name, array in (("filters", filters), ("whitening", whitening), ("mean", mean)):
+        if array.dtype != np.float32 or not (np.abs(array) <= _LARGEST).all():
+            raise InputError(f"{name} must be finite float32 of at most {_LARGEST:g}")

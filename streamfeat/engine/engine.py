@@ -1,0 +1,396 @@
+"""The engine: all streaming state of one sensor, and the rules for changing it.
+
+Lives here: feeding events, moving stream time, reading features, snapshots. Synchronous and exact.
+Not here: clocks, I/O, logging, asyncio, labels, classifiers. Time comes from events and `advance` only.
+
+Feeding touches counts alone, so it never waits for the filters; reading brings projections, codes and
+pooled sums up to date with whatever has changed since. What is read depends on the events and on stream
+time, never on how often it was read or how the stream was cut into batches.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.operator import n_features, with_fixed_point
+from streamfeat.engine.state import allocate_state
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution, as_events
+from streamfeat.kernels.encode import encode_volume
+from streamfeat.kernels.follow import follow, trace
+from streamfeat.kernels.ingest import advance_to_bin, count_events
+from streamfeat.kernels.lasso import CODE
+from streamfeat.kernels.layout import (
+    BEFORE_TIME,
+    CLOCK_NOW,
+    CLOCK_ORIGIN,
+    CLOCK_PLANE,
+    CLOCK_SLOT,
+    CLOCK_START,
+    CLOCK_TOUCHED,
+    CURSOR_CODED,
+    MOMENT_SQUARES,
+    PARTS,
+    TALLY_EVENTS,
+)
+from streamfeat.kernels.planes import complete, look_ahead
+from streamfeat.kernels.update import finish, mark_dirty, read, renew, settle, update
+
+__all__ = ["Engine", "EngineStats", "Snapshot", "Spread"]
+
+Spread = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
+"""Calls a function for each of some numbers: `map`, one after the other, or the `map` of an executor."""
+
+_WORTH_SPREADING = 1 << 20
+"""Filters times volumes or entries that changed: a millisecond of work at least, against a tenth of one for
+handing half of it to another thread."""
+
+
+@dataclass(frozen=True, slots=True)
+class EngineStats:
+    """What an engine has seen.
+
+    Attributes:
+        events: accepted and counted.
+        late: older than the window; they changed nothing.
+        rejected: outside the sensor, polarity not 0 or 1, or time beyond 2^62; they changed nothing.
+        saturated: accepted, but the clipped count stayed as it was.
+        rolls: bins that stream time has moved on by.
+        active_volumes: volumes that were not empty when features were last read.
+        encoded_volumes: volumes encoded so far, a measure of the work done.
+    """
+
+    events: int
+    late: int
+    rejected: int
+    saturated: int
+    rolls: int
+    active_volumes: int
+    encoded_volumes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """All that an engine needs to go on as if nothing had happened.
+
+    Attributes:
+        fingerprint: of the encoder.
+        counts: `(T, H, W)` int32, the ring; bin `b` lives in slot `b % T`.
+        atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
+        bin: the current one; `BEFORE_TIME` in an engine that has seen nothing.
+        origin_us: stream time at which bin 0 starts.
+        tally: `(5,)` int64, what was counted.
+        encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
+    """
+
+    fingerprint: str
+    counts: NDArray[np.int32]
+    atoms: NDArray[np.float64]
+    bin: int
+    origin_us: int
+    tally: NDArray[np.int64]
+    encoded: NDArray[np.int64]
+
+
+class Engine:
+    """Turns a stream of events into features, exactly.
+
+    Args:
+        encoder: the frozen encoder.
+        resolution: `(height, width)` of the sensor.
+        origin_us: stream time at which bin 0 starts.
+        look_ahead: prepare each bin boundary beforehand, in slices: with every event that is followed, and
+            in `prepare`. Costs a second copy of the projections; for those who read after single events.
+        spread: how the two halves of a large reading are made: `map`, or an executor's, for two cores.
+
+    Raises:
+        InputError: the sensor has no place for a single volume, or so many that sums could overflow; or the
+            origin is beyond 2^62 microseconds.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        resolution: Resolution,
+        *,
+        origin_us: int = 0,
+        look_ahead: bool = False,
+        spread: Spread = map,
+    ) -> None:
+        """Allocate everything; nothing is allocated later but the copies that are handed out."""
+        self.encoder = encoder
+        self.resolution = resolution
+        self.grid_shape = encoder.geometry.grid_shape(resolution)
+        self._spread = spread
+        self._operator = with_fixed_point(encoder.operator, self.grid_shape)
+        self._state = allocate_state(
+            encoder.geometry,
+            self._operator,
+            resolution,
+            origin_us=self._checked_time(origin_us),
+            planes=2 if look_ahead else 1,
+        )
+
+    def feed(self, batch: Events) -> None:
+        """Count the events of a batch. Exact, whatever the order, and cheap.
+
+        Args:
+            batch: `(n,)` EVENT_DTYPE, not changed; or a structured array of another tool, which is converted
+                (see `as_events`). Any content: what cannot be used is counted in `stats()` as `late` or
+                `rejected`.
+
+        Raises:
+            InputError: not such an array, or one whose polarities mean nobody knows what.
+        """
+        events = self._checked(batch)
+        count_events(events, self._operator, self._state)
+
+    def follow(self, batch: Events) -> None:
+        """Feed a batch event by event, with features brought up to date after each.
+
+        Leaves the engine as `feed` and a reading would. Costs more for many events, and less for one.
+
+        Args:
+            batch: as for `feed`.
+
+        Raises:
+            InputError: as for `feed`.
+        """
+        events = self._checked(batch)
+        self._update()
+        follow(events, self.grid_shape, self._operator, self._state)
+
+    def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Feed a batch event by event, and read the features after each.
+
+        Args:
+            batch: as for `feed`, `n` events.
+
+        Returns:
+            features `(n, n_features)` float32, a row after each event, and `(n,)` int64, how many events
+            had been accepted by then.
+
+        Raises:
+            InputError: as for `feed`.
+        """
+        events = self._checked(batch)
+        self._update()
+        features = np.empty((len(events), n_features(self._operator)), np.float32)
+        accepted = np.empty(len(events), np.int64)
+        trace(events, self.grid_shape, self._operator, self._state, features, accepted)
+        return features, accepted
+
+    def prepare(self, columns: int) -> bool:
+        """Use idle time to look ahead to the next bin boundary.
+
+        Args:
+            columns: operator columns that may be added, a bound of the work.
+
+        Returns:
+            whether nothing is left to prepare.
+        """
+        self._update()
+        volumes = self.grid_shape[0] * self.grid_shape[1]
+        left = look_ahead(volumes, volumes, columns, self.grid_shape, self._operator, self._state)
+        return bool(left > 0)
+
+    def _update(self) -> None:
+        """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
+        shape, operator, state = self.grid_shape, self._operator, self._state
+        if self._is_complete and not state.clock[CLOCK_TOUCHED]:
+            return
+        volumes = 0 if self._is_complete else shape[0] * shape[1]
+        large = max(volumes, int(state.clock[CLOCK_TOUCHED])) * operator.offset.shape[0] >= _WORTH_SPREADING
+        if self._spread is map or not large:
+            update(shape, operator, state)
+            return
+        mark_dirty(shape, operator, state)
+        self._halves(lambda part: renew(part, shape, operator, state))
+        settle(operator, state)
+        self._halves(lambda part: complete(part, shape, operator, state))
+        finish(shape, state)
+
+    @property
+    def _is_complete(self) -> bool:
+        state = self._state
+        coded = state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED]
+        return bool(coded == self.grid_shape[0] * self.grid_shape[1])
+
+    def _halves(self, work: Callable[[int], None]) -> None:
+        for _ in self._spread(work, range(PARTS)):
+            pass
+
+    @staticmethod
+    def _checked(batch: Events) -> Events:
+        events = as_events(batch)
+        if not (events.flags.writeable and events.flags.c_contiguous):
+            return events.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
+        return events
+
+    def advance(self, t_us: int) -> None:
+        """Let stream time pass without events. Going back in time does nothing.
+
+        Args:
+            t_us: the bin of this time becomes the current one.
+
+        Raises:
+            InputError: the time is beyond 2^62 microseconds.
+        """
+        since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
+        new = since // self._operator.bin_us
+        if new > self._state.clock[CLOCK_NOW]:
+            advance_to_bin(new, self._operator, self._state)
+
+    @staticmethod
+    def _checked_time(t_us: int) -> int:
+        if not BEFORE_TIME < t_us < -BEFORE_TIME:
+            raise InputError(f"a time of {t_us} us is beyond 2^62")
+        return int(t_us)
+
+    def features(self) -> NDArray[np.float32]:
+        """The pooled codes of the current window, a copy: `(n_features,)` float32."""
+        if self._spread is not map:
+            self._update()
+        features = np.empty(n_features(self._operator), np.float32)
+        read(self.grid_shape, self._operator, self._state, features)
+        return features
+
+    def codes(self) -> NDArray[np.float32]:
+        """The code of every local volume, a copy: `(rows, columns, K)` float32, before any split."""
+        self._update()
+        state, operator = self._state, self._operator
+        plane = state.clock[CLOCK_PLANE]
+        rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
+        codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
+        for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
+            encode_volume(projection, moments, atoms, False, 0, operator, state)
+            code[:] = state.code[0, 0, : operator.n_filters] / operator.unit
+        return codes.reshape(*self.grid_shape, operator.n_filters)
+
+    def counts(self) -> NDArray[np.int32]:
+        """The signed counts of the current window, a copy: `(n_bins, H, W)` int32, the oldest bin first, not
+        clipped.
+        """
+        return np.roll(self._state.counts, -1 - int(self._state.clock[CLOCK_SLOT]), axis=0)
+
+    def activity(self) -> NDArray[np.int64]:
+        """The sum of squared entries of every local volume, a copy: `(rows, columns)` int64; 0 is empty."""
+        self._update()
+        squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
+        return squares.reshape(self.grid_shape).copy()
+
+    @property
+    def window_us(self) -> tuple[int, int]:
+        """Stream time at which the oldest bin starts, and at which the current one ends."""
+        now, origin = int(self._state.clock[CLOCK_NOW]), int(self._state.clock[CLOCK_ORIGIN])
+        end = origin + (now + 1) * self._operator.bin_us
+        return end - self.encoder.geometry.window_us, end
+
+    @property
+    def n_events(self) -> int:
+        """Events accepted and counted, as in `stats()`."""
+        return int(self._state.tally[TALLY_EVENTS])
+
+    def stats(self) -> EngineStats:
+        """Counts since the engine was made (or since the snapshot that was restored)."""
+        events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)
+        encoded = int(self._state.encoded.sum())
+        plane = self._state.clock[CLOCK_PLANE]
+        active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
+        return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
+
+    def restart(self, origin_us: int) -> None:
+        """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted.
+
+        Raises:
+            InputError: the origin is beyond 2^62 microseconds.
+        """
+        state, origin = self._state, self._checked_time(origin_us)
+        state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
+        for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
+            array[:] = 0
+        state.pooled[:] = 0
+        state.cursors[:] = 0
+        state.clock[:] = 0
+        state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+        state.clock[CLOCK_ORIGIN] = origin
+
+    def snapshot(self) -> Snapshot:
+        """Copy the state. Projections and codes are not part of it: they follow from the counts.
+
+        With the inverse formulation a code follows from the one before it, too, within its gap. So that an
+        engine which goes on and one which is restored have the same bits, this one starts again from the
+        codes that it gives away: a bin boundary costs as much.
+        """
+        state = self._state
+        atoms = state.atoms[state.clock[CLOCK_PLANE], :, CODE].copy()
+        if self._operator.inverse:
+            self._update()
+            atoms[:] = state.atoms[state.clock[CLOCK_PLANE], :, CODE]
+            state.atoms[np.arange(len(state.atoms)) != state.clock[CLOCK_PLANE]] = 0
+            state.cursors[:] = 0
+            state.pooled[:] = 0
+            self._update()
+        return Snapshot(
+            fingerprint=self.encoder.fingerprint,
+            counts=state.counts.copy(),
+            atoms=atoms,
+            bin=int(state.clock[CLOCK_NOW]),
+            origin_us=int(state.clock[CLOCK_ORIGIN]),
+            tally=state.tally.copy(),
+            encoded=state.encoded.copy(),
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go on from a snapshot of an engine with the same encoder and resolution.
+
+        Arrays and numbers may come from anywhere: nothing that was not checked gets to a kernel.
+
+        Raises:
+            InputError: the snapshot is of another encoder or another resolution, or of no engine at all;
+                nothing has changed.
+        """
+        self._check(snapshot)
+        state, limit = self._state, self._operator.max_count
+        codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
+        self.restart(snapshot.origin_us)
+        state.counts[:] = snapshot.counts
+        state.applied[:] = snapshot.counts.clip(-limit, limit)
+        codes[:] = snapshot.atoms
+        if snapshot.bin > BEFORE_TIME:
+            state.clock[CLOCK_NOW] = snapshot.bin
+            state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
+            state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
+        # Before time moves on: lasso codes are kept of volumes only that are not empty.
+        update(self.grid_shape, self._operator, state)
+        codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
+        state.tally[:] = snapshot.tally
+        state.encoded[:] = snapshot.encoded
+
+    def _check(self, snapshot: Snapshot) -> None:
+        state, operator = self._state, self._operator
+        if snapshot.fingerprint != self.encoder.fingerprint:
+            raise InputError(
+                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
+                f"{self.encoder.fingerprint[:12]}"
+            )
+        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, state.encoded)
+        for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
+            given = getattr(snapshot, name)
+            if given.dtype != array.dtype or given.shape != array.shape:
+                raise InputError(
+                    f"the snapshot holds {name} of {given.dtype} {given.shape}, this engine has "
+                    f"{array.dtype} {array.shape}"
+                )
+        # No solution exceeds half of it; one within the gap may, by a little.
+        if not (np.abs(snapshot.atoms) <= 2 * operator.largest).all():
+            raise InputError("the snapshot: an entry of a code is no number, or too large")
+        if min(snapshot.tally.min(), snapshot.encoded.min()) < 0:
+            raise InputError("the snapshot: something was counted less than zero times")
+        self._checked_time(snapshot.origin_us)
+        if snapshot.bin != BEFORE_TIME:
+            self._checked_time(snapshot.origin_us + snapshot.bin * operator.bin_us)

@@ -1,0 +1,224 @@
+"""Making and checking the integers that an encoder applies online.
+
+Lives here: from learned floats to a `kernels.layout.Operator`, the arithmetic that proves that nothing can
+overflow, and the fixed point that codes are pooled in.
+Not here: files (`encoder`), and what changes as events come (`state`).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.engine.geometry import Geometry
+from streamfeat.errors import InputError
+from streamfeat.kernels.layout import FEATURE_ENCODINGS, LANES, SPLIT, TRIANGLE, Operator
+
+__all__ = ["check_operator", "fixed_fields", "n_features", "quantise", "with_fixed_point"]
+
+_INT16, _INT32 = 2**15 - 1, 2**31 - 1
+
+MOST_BITS, FEWEST_BITS = 16, 8
+"""Codes are pooled as multiples of `2**-bits`; as fine as the sensor's number of volumes lets them be."""
+
+
+def fixed_fields(
+    geometry: Geometry, formulation: str, encoding: str, threshold: float, filters: NDArray[np.float32]
+) -> dict[str, Any]:
+    """The fields of an operator that follow exactly from the parameters."""
+    kind = FEATURE_ENCODINGS[encoding]
+    inverse = formulation == "inverse" and kind != TRIANGLE
+    atoms = filters.astype(np.float64)
+    return {
+        "patch": geometry.patch,
+        "stride": geometry.stride,
+        "downsample": geometry.downsample,
+        "bin_us": geometry.bin_us,
+        "max_count": geometry.max_count,
+        "pooling": geometry.pooling,
+        "n_filters": filters.shape[0],
+        "kind": kind,
+        "inverse": inverse,
+        "unit": 1.0,
+        "largest": math.inf,
+        "threshold": float(np.float32(threshold)),
+        "gram": (atoms @ atoms.T).astype(np.float32) if inverse else np.zeros((0, 0), np.float32),
+    }
+
+
+def quantise(
+    geometry: Geometry,
+    fixed: dict[str, Any],
+    filters: NDArray[np.float32],
+    whitening: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    eps: float,
+    gap: float,
+) -> Operator:
+    """Fold whitening and mean removal into one matrix of int16, with one scale for all filters.
+
+    Args:
+        geometry: of the local volumes, `d` entries each.
+        fixed: as `fixed_fields` gives them.
+        filters: `(K, d)`.
+        whitening: `(d, d)`.
+        mean: `(d,)`.
+        eps: added to the variance of a volume.
+        gap: relative duality gap of the lasso.
+    """
+    k, d = filters.shape
+    padded = -(-k // LANES) * LANES
+    white = whitening.astype(np.float64)
+    projector = filters.astype(np.float64) @ white
+    offset = projector @ mean
+    # Mean removal: P (I - 1 1'/d).
+    projector -= projector.mean(axis=1, keepdims=True)
+    scale = float(np.abs(projector).max()) / _INT16 or 1.0
+    columns = np.zeros((d, padded), np.int16)
+    columns[:, :k] = np.rint(projector.T / scale)
+    padded_offset = np.zeros(padded, np.float32)
+    padded_offset[:k] = offset
+    square_norms = np.zeros(padded, np.float32)
+    square_norms[:k] = np.square(filters.astype(np.float64)).sum(axis=1)
+    quadratic, linear = np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
+    quadratic_scale = linear_scale = 1.0
+    reach = 0.0
+    if fixed["inverse"] or fixed["kind"] == TRIANGLE:
+        centred = white - white.mean(axis=1, keepdims=True)
+        form = centred.T @ centred
+        form = (form + form.T) / 2
+        row = (white @ mean) @ centred
+        # The largest scale at which neither an entry nor any sum of them can overflow.
+        sum_of_form = float(np.abs(form).sum()) * geometry.max_count**2
+        quadratic_scale = max(float(np.abs(form).max()) / _INT32, sum_of_form / 2.0**61, 1e-30)
+        linear_scale = max(float(np.abs(row).max()) / _INT32, 1e-30)
+        quadratic = np.rint(form / quadratic_scale).astype(np.int32)
+        linear = np.rint(row / linear_scale).astype(np.int32)
+        # |x| <= |W (I - 1 1'/d)| |v_hat| + |W mu|, and |v_hat| <= sqrt(d).
+        stretch = math.sqrt(max(float(np.linalg.eigvalsh(form)[-1]), 0.0))
+        reach = stretch * math.sqrt(d) + float(np.linalg.norm(white @ mean))
+    return Operator(
+        **fixed,
+        columns=columns,
+        scale=scale,
+        eps=float(eps),
+        offset=padded_offset,
+        quadratic=quadratic,
+        quadratic_scale=quadratic_scale,
+        linear=linear,
+        linear_scale=linear_scale,
+        constant=float(np.square(white @ mean).sum()),
+        reach=reach,
+        square_norms=square_norms,
+        gap=float(gap),
+    )
+
+
+def check_operator(geometry: Geometry, operator: Operator) -> Operator:
+    """Refuse an operator whose arrays do not fit, or whose integers could overflow.
+
+    Returns:
+        the operator, with `largest` filled in.
+
+    Raises:
+        InputError: with the arithmetic.
+    """
+    d, padded = geometry.entries, -(-operator.n_filters // LANES) * LANES
+    form = (d, d) if operator.inverse or operator.kind == TRIANGLE else (0, 0)
+    expected: dict[str, tuple[type, tuple[int, ...]]] = {
+        "columns": (np.int16, (d, padded)),
+        "offset": (np.float32, (padded,)),
+        "square_norms": (np.float32, (padded,)),
+        "quadratic": (np.int32, form),
+        "linear": (np.int32, form[:1]),
+    }
+    for name, (dtype, shape) in expected.items():
+        array = getattr(operator, name)
+        if array.dtype != dtype or array.shape != shape:
+            raise InputError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}")
+    if not (0 < operator.eps < math.inf and operator.scale > 0 and 0 < operator.gap < 1):
+        raise InputError("eps, scale and gap must be finite and above zero, and gap below one")
+    if (operator.columns < -_INT16).any():
+        raise InputError(f"columns must lie between {-_INT16} and {_INT16}, so that all can be negated")
+    if operator.columns[:, operator.n_filters :].any():
+        raise InputError(f"columns holds more filters than {operator.n_filters}")
+    if not (np.isfinite(operator.offset).all() and np.isfinite(operator.square_norms).all()):
+        raise InputError("offset and square_norms must be finite")
+    if form[0]:
+        _check_form(geometry, operator)
+    magnitude = np.abs(operator.columns.astype(np.int64))
+    sums = geometry.max_count * int(magnitude.sum(axis=0).max())
+    if sums > _INT32:
+        raise InputError(
+            f"geometry: a projection could reach max_count {geometry.max_count} x "
+            f"{sums // geometry.max_count} (the largest sum of a quantised filter) = {sums}, "
+            "which is not below 2^31; lower max_count"
+        )
+    checked = operator._replace(largest=_largest_code(operator))
+    _fixed_point_bits(checked, 1)
+    return checked
+
+
+def _check_form(geometry: Geometry, operator: Operator) -> None:
+    """Refuse a quadratic or linear form that could overflow."""
+    total = np.abs(operator.quadratic.astype(np.float64)).sum() * geometry.max_count**2
+    if total >= 2.0**62 or not np.array_equal(operator.quadratic, operator.quadratic.T):
+        raise InputError(f"quadratic must be symmetric and sum to less than 2^62, it sums to {total:.4g}")
+    if not (operator.quadratic_scale > 0 and operator.linear_scale > 0 and operator.constant >= 0):
+        raise InputError("the scales and the constant of the quadratic form must not be negative")
+    if not 0 < operator.reach < math.inf:
+        raise InputError(f"reach is {operator.reach}, it must be finite and above zero")
+
+
+def _largest_code(operator: Operator) -> float:
+    d = operator.columns.shape[0]
+    norms = np.sqrt(np.square(operator.columns.astype(np.float64)).sum(axis=0)) * operator.scale
+    # Rounding leaves a trace of the mean in each filter; it weighs most in a volume that is nearly constant.
+    leak = np.abs(operator.columns.sum(axis=0, dtype=np.int64)) * operator.scale
+    z = float(
+        norms.max() * math.sqrt(d)
+        + leak.max() * operator.max_count / math.sqrt(operator.eps)
+        + np.abs(operator.offset).max()
+    )
+    if operator.inverse:
+        # At the solution lambda |l|_1 <= 1/2 |x|^2.
+        return max(z, operator.reach**2 / (2 * operator.threshold))
+    if operator.kind == TRIANGLE:
+        return max(z, math.sqrt(operator.reach**2 + 2 * z + float(operator.square_norms.max())))
+    return z
+
+
+def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operator:
+    """The operator with codes in units of the finest fixed point that a grid of volumes allows.
+
+    Args:
+        operator: in units of one.
+        grid_shape: rows and columns of volumes; those of one cell share a sum.
+
+    Raises:
+        InputError: the pooled sums could overflow whatever the fixed point.
+    """
+    rows, columns = grid_shape
+    volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling)
+    unit = 2.0 ** _fixed_point_bits(operator, volumes)
+    offset = operator.offset * np.float32(unit)
+    offset.flags.writeable = False
+    return operator._replace(unit=unit, offset=offset, threshold=operator.threshold * unit)
+
+
+def n_features(operator: Operator) -> int:
+    """Length of the feature vector: `pooling^2` cells of `K` codes, or of `2 K` for `split`."""
+    return operator.pooling**2 * operator.n_filters * (2 if operator.kind == SPLIT else 1)
+
+
+def _fixed_point_bits(operator: Operator, volumes: int) -> int:
+    room = _INT32 / (max(operator.largest, 1.0) * volumes)
+    bits = math.floor(math.log2(room)) if room > 0 else -1
+    if not bits >= FEWEST_BITS:
+        raise InputError(
+            f"a pooled code could reach {operator.largest:.4g} x {volumes} volumes of a cell, which "
+            f"leaves {bits} bits behind the point of an int32, {FEWEST_BITS} are needed; raise the stride, "
+            "the downsample, the threshold or eps_zca"
+        )
+    return min(bits, MOST_BITS)

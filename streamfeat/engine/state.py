@@ -1,0 +1,98 @@
+"""Allocating the state that kernels change.
+
+Lives here: shapes of the arrays in `kernels.layout.State`.
+Not here: what an event does to them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.engine.geometry import Geometry
+from streamfeat.events import Resolution
+from streamfeat.kernels.layout import (
+    BEFORE_TIME,
+    CLOCK_NOW,
+    CLOCK_ORIGIN,
+    CLOCK_START,
+    PARTS,
+    SPLIT,
+    Operator,
+    State,
+)
+
+__all__ = ["allocate_state"]
+
+
+def allocate_state(
+    geometry: Geometry,
+    operator: Operator,
+    resolution: Resolution,
+    *,
+    origin_us: int = 0,
+    planes: int = 1,
+    keep: bool = True,
+) -> State:
+    """An empty state for one sensor.
+
+    Args:
+        geometry: of the local volumes.
+        operator: gives the number of filters and the encoding.
+        resolution: `(height, width)` of the sensor.
+        origin_us: start of bin 0.
+        planes: 1, or 2 to look ahead.
+        keep: keep a projection for each volume; without, the state serves whole windows only.
+
+    Raises:
+        InputError: the sensor has no place for a volume.
+    """
+    rows, columns = geometry.grid_shape(resolution)
+    ring = (geometry.n_bins, *geometry.ring_shape(resolution))
+    volumes = rows * columns if keep else 1
+    padded = operator.offset.shape[0]
+    atoms = operator.n_filters if operator.inverse else 0
+    clock = np.zeros(7, np.int64)
+    clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+    clock[CLOCK_ORIGIN] = origin_us
+    features = 2 * padded if operator.kind == SPLIT else padded
+    return State(
+        counts=np.zeros(ring, np.int32),
+        applied=np.zeros(ring, np.int16),
+        touched=np.zeros(int(np.prod(ring)) + 1, np.int32),
+        is_touched=np.zeros(ring, np.uint8),
+        touched_slots=np.zeros(geometry.n_bins, np.uint8),
+        ring_rows=(np.arange(resolution[0]) // geometry.downsample).astype(np.int32),
+        ring_columns=(np.arange(resolution[1]) // geometry.downsample).astype(np.int32),
+        volume_rows=_covering(geometry, ring[1], rows),
+        volume_columns=_covering(geometry, ring[2], columns),
+        clock=clock,
+        cursors=np.zeros((planes, 3), np.int64),
+        tally=np.zeros(5, np.int64),
+        encoded=np.zeros(PARTS, np.int64),
+        projections=np.zeros((planes, volumes, padded), np.int32),
+        moments=np.zeros((planes, volumes, 4), np.int64),
+        atoms=np.zeros((planes, volumes, 2, atoms), np.float64),
+        pooled=np.zeros((planes, operator.pooling**2, features), np.int32),
+        cells=_cells(operator.pooling, rows, columns),
+        dirty=np.zeros(planes * volumes, np.int32),
+        is_dirty=np.zeros(planes * volumes, np.uint8),
+        code=np.zeros((PARTS, 2, padded), np.int32),
+        work=np.zeros((PARTS, 5, padded), np.float64),
+        active=np.zeros((PARTS, padded), np.int64),
+        values=np.zeros((PARTS, geometry.entries), np.int16),
+        entries=np.zeros((PARTS, geometry.entries), np.int32),
+        changes=np.zeros((PARTS, geometry.entries), np.int16),
+        corners=np.zeros((PARTS, atoms * padded), np.float32),
+    )
+
+
+def _cells(pooling: int, rows: int, columns: int) -> NDArray[np.int32]:
+    """Cell of each volume of a grid, row by row: the sides of the grid are cut into `pooling` equal parts."""
+    down, across = np.arange(rows) * pooling // rows, np.arange(columns) * pooling // columns
+    return np.add.outer(down * pooling, across).astype(np.int32).ravel()
+
+
+def _covering(geometry: Geometry, pixels: int, volumes: int) -> NDArray[np.int32]:
+    """First and last plus one of the volumes along an axis that cover each of `n` pixels: `(n, 2)`."""
+    starts, pixel = np.arange(volumes) * geometry.stride, np.arange(pixels)
+    first = np.searchsorted(starts, pixel - geometry.patch, side="right")
+    return np.stack([first, np.searchsorted(starts, pixel, side="right")], axis=1).astype(np.int32)

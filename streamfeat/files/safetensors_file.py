@@ -1,0 +1,68 @@
+"""The safetensors files that models and classifiers are kept in.
+
+Lives here: arrays and a JSON header, written whole, and read from bytes that nobody has vouched for.
+Not here: what the arrays mean; whoever asks for them checks shapes and ranges.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from streamfeat.errors import InputError
+from streamfeat.files.atomic import write_atomically
+
+__all__ = ["one_line", "read_safetensors", "write_safetensors"]
+
+
+def write_safetensors(
+    path: Path, kind: str, version: int, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+) -> None:
+    """Write arrays and a JSON header as one file, which appears whole or not at all."""
+    # safetensors writes the buffer of an array as it lies, so a transposed view would come back scrambled.
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    text = json.dumps({"format": kind, "version": version, **header})
+    write_atomically(path, save(contiguous, metadata={"streamfeat": text}))
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, on one line."""
+    text = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+    return " ".join(text.split())
+
+
+def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read all arrays of a safetensors file and the JSON header that streamfeat keeps with them.
+
+    Raises:
+        InputError: the file cannot be read, or its header is not of this kind and version.
+    """
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("streamfeat", "null"))
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (
+        OSError,
+        SafetensorError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise InputError(f"{path}: not a readable safetensors file: {one_line(error)}") from error
+    if not isinstance(header, dict) or header.get("format") != kind:
+        raise InputError(f"{path}: a safetensors file, but not a {kind} file")
+    if header.get("version") != version:
+        raise InputError(
+            f"{path}: format version {header.get('version')!r}, this streamfeat reads version {version}; "
+            "make the file again"
+        )
+    return arrays, header

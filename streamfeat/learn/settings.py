@@ -1,0 +1,145 @@
+"""What learning can be told, in one place.
+
+Lives here: `Setting`, its checks, its presets. Not here: what is done with it (`fit`).
+Imports nothing that is slow to import, so that a command line can show its defaults.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, get_args
+
+from streamfeat.errors import InputError
+
+if TYPE_CHECKING:
+    from streamfeat.engine.encoder import Encoding, Formulation
+
+__all__ = ["DEFAULTS", "PRESETS", "THRESHOLDS", "Setting", "preset_with"]
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    # A quarter of the volumes, and of the cost of an event.
+    "fast": {"stride": 4},
+    # Kostadinov and Scaramuzza (ICPR 2020/21): a quarter of the pixels. Counts are not clipped there; 127 is
+    # what a byte holds.
+    "paper": {
+        "filters": 1700,
+        "stride": 4,
+        "bins": 7,
+        "downsample": 2,
+        "max_count": 127,
+        "encoding": "triangle",
+    },
+}
+"""What each preset has other than the defaults of `Setting`."""
+
+THRESHOLDS = {"direct": 0.5, "inverse": 1.0}
+"""Default sparsity penalty of each formulation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """What `streamfeat learn` can be told of geometry and learning, with its defaults.
+
+    Names that `Geometry` has as well are handed on to it.
+
+    Attributes:
+        formulation: which of the paper's problems is solved, `direct` or `inverse`.
+        encoding: what is pooled, `soft`, `split` or `triangle`.
+        filters: number of filters or atoms, `K`.
+        patch: rows and columns of a local volume, in ring pixels.
+        stride: ring pixels between neighbouring volumes.
+        bins: time bins in the window.
+        window_ms: length of the window; None for one that holds 95 % of the labelled
+            samples whole, 100 ms without labels.
+        downsample: sensor pixels along each side of a ring pixel.
+        max_count: counts are clipped to `[-max_count, max_count]`.
+        pooling: cells along each side of the grid of volumes; codes are summed over each cell.
+        threshold: `lambda0`, in learning and in use; None for that of `THRESHOLDS`.
+        conditioning: weight in `Omega`; None for the learner's own, as for the next two. Direct only.
+        coherence: weight in `Omega`.
+        log_det: weight in `Omega`. Direct only.
+        volumes: local volumes to learn from.
+        iterations: alternations at most.
+        seed: of every random choice.
+
+    Raises:
+        InputError: a value is out of range, or there are too few volumes for the others.
+    """
+
+    formulation: "Formulation" = "direct"
+    encoding: "Encoding" = "split"
+    filters: int = 400
+    patch: int = 12
+    stride: int = 2
+    bins: int = 3
+    window_ms: float | None = None
+    downsample: int = 1
+    max_count: int = 1
+    pooling: int = 2
+    threshold: float | None = None
+    conditioning: float | None = None
+    coherence: float | None = None
+    log_det: float | None = None
+    volumes: int = 50_000
+    iterations: int = 20
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a recording."""
+        from streamfeat.engine.encoder import Encoding, Formulation
+
+        for name, kind in (("formulation", Formulation), ("encoding", Encoding)):
+            if getattr(self, name) not in get_args(kind):
+                raise InputError(
+                    f"{name} is {getattr(self, name)!r}, it must be one of {', '.join(get_args(kind))}"
+                )
+        if self.bins < 1:
+            raise InputError(f"{self.bins} bins are not possible; give at least one")
+        if self.window_ms is not None and not 0 < self.window_ms < 1e9:
+            raise InputError(f"a window of {self.window_ms} ms is not possible")
+        if not 0 <= self.penalty < math.inf or (self.formulation == "inverse" and self.penalty == 0):
+            raise InputError(f"threshold is {self.penalty}, it must be finite and above zero")
+        for name, weight in self.weights.items():
+            if not 0 <= weight < math.inf:
+                raise InputError(f"{name} is {weight}, it must be finite and not negative")
+            if self.formulation == "inverse" and name != "coherence":
+                raise InputError(
+                    f"{name} is a weight of the direct formulation; the inverse has coherence only, since "
+                    "its atoms have unit length"
+                )
+        if self.volumes < 2 or self.iterations < 1 or self.filters < 1:
+            raise InputError("at least two volumes, one iteration and one filter are needed to learn")
+        entries = self.bins * self.patch * self.patch
+        if self.volumes < max(self.filters, entries + 1):
+            raise InputError(
+                f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
+                f"{entries} entries; learn from at least {max(self.filters, entries + 1)}"
+            )
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"seed is {self.seed}, it must be from 0 to 2^32 - 1")
+
+    @property
+    def penalty(self) -> float:
+        """`lambda0`."""
+        return THRESHOLDS[self.formulation] if self.threshold is None else self.threshold
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights in `Omega` that were given."""
+        named = {name: getattr(self, name) for name in ("conditioning", "coherence", "log_det")}
+        return {name: weight for name, weight in named.items() if weight is not None}
+
+
+DEFAULTS = {field.name: field.default for field in fields(Setting)}
+"""Of each name of a setting."""
+
+
+def preset_with(preset: str, changes: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `Setting` by a preset's name; a change that is None changes nothing.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"there is no preset {preset!r}; choose from {', '.join(PRESETS)}")
+    return PRESETS[preset] | {name: value for name, value in changes.items() if value is not None}

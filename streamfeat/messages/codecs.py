@@ -1,0 +1,378 @@
+"""Packet payloads to events and back, for the four encodings of event_camera_msgs.
+
+Lives here: `mono`, `libcaer`, `libcaer_cmp` and `evt3`, bytes in and arrays out.
+Not here: messages around the payload, files, and the resolution: events outside it are decoded like any
+other, and counted where they are fed.
+
+Payloads are hostile until proven otherwise. What a payload can make us allocate is bounded by 96 times its
+length (a 16-bit word holds at most 12 events of 16 bytes) and by `MAX_PACKET_EVENTS` events.
+"""
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.errors import InputError
+from streamfeat.events import EVENT_DTYPE, Events, make_events
+from streamfeat.kernels.decode import decode_evt3, decode_libcaer_cmp
+
+__all__ = [
+    "EVT3_WRAP_US",
+    "MAX_PACKET_EVENTS",
+    "PAYLOAD_ENCODINGS",
+    "Decoder",
+    "Evt3Decoder",
+    "encode",
+    "make_decoder",
+]
+
+MAX_PACKET_EVENTS = 1 << 24
+"""No payload may hold more events than this (268 MB of them); real packets hold 100 to 100,000."""
+
+_Words = NDArray[np.uint16]
+
+_LIBCAER = np.dtype([("data", "<u4"), ("us", "<u4")])
+_LIBCAER_WRAP_US = 1 << 31
+EVT3_WRAP_US = 1 << 24
+_EVT3_MAX_STEP = 1 << 11  # of TIME_HIGH: half of its 12 bits, so that no reader takes it for a step back
+_EVT3_MAX_BRIDGE = 1 << 12  # TIME_HIGH words that may cross a silent gap: 9.5 hours
+
+
+class Decoder(Protocol):
+    """The decoder of one topic; it may carry state from packet to packet."""
+
+    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+        """Decode one payload.
+
+        Args:
+            payload: the bytes of the packet, not changed.
+            time_base_ns: `time_base` of the packet, nanoseconds.
+
+        Returns:
+            `(n,)` array of `EVENT_DTYPE`, stream time in microseconds, in stored order.
+
+        Raises:
+            InputError: the payload cannot be what its encoding says; no state has changed.
+        """
+
+    def resync(self) -> None:
+        """Forget what packets before a gap said about the ones after it."""
+
+    def snapshot(self) -> list[int]:
+        """The state that is carried on; empty where packets stand alone."""
+
+    def restore(self, state: list[int]) -> None:
+        """Go on from a snapshot.
+
+        Args:
+            state: numbers from 0 to 2^62.
+
+        Raises:
+            InputError: there are more or fewer than this decoder has.
+        """
+
+
+class _Alone:
+    """What the decoders share whose packets stand alone."""
+
+    def resync(self) -> None:
+        """See `Decoder.resync`."""
+
+    def snapshot(self) -> list[int]:
+        """See `Decoder.snapshot`."""
+        return []
+
+    def restore(self, state: list[int]) -> None:
+        """See `Decoder.restore`."""
+        if state:
+            raise InputError("the snapshot of a decoder holds more than it has")
+
+
+class _Carrying:
+    """What the decoders share that carry on a state."""
+
+    _state: NDArray[np.int64]
+
+    def snapshot(self) -> list[int]:
+        """See `Decoder.snapshot`."""
+        return [int(value) for value in self._state]
+
+    def restore(self, state: list[int]) -> None:
+        """See `Decoder.restore`."""
+        if len(state) != len(self._state):
+            raise InputError(f"the snapshot of a decoder holds {len(state)} numbers, not {len(self._state)}")
+        self._state[:] = state
+
+
+class MonoDecoder(_Alone):
+    """`mono`: u64 words of `dt` ns (32 bits), x (16), y (15) and polarity (1)."""
+
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Refuse packets of more events than this."""
+        self._max_events = max_events
+
+    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+        """See `Decoder.decode`."""
+        words = _records(payload, np.dtype("<u8"), "mono", self._max_events)
+        dt_ns = (words & 0xFFFFFFFF).astype(np.int64)
+        # time_base may use all 64 bits, so the sum is taken apart instead of overflowing
+        t = time_base_ns // 1000 + (time_base_ns % 1000 + dt_ns) // 1000
+        return make_events(words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63, t)
+
+
+class LibcaerDecoder(_Alone):
+    """`libcaer`: u32 address and polarity, then u32 microseconds that wrap at 31 bits within a packet."""
+
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Refuse packets of more events than this."""
+        self._max_events = max_events
+
+    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+        """See `Decoder.decode`."""
+        records = _records(payload, _LIBCAER, "libcaer", self._max_events)
+        data = records["data"]
+        us = (records["us"] & (_LIBCAER_WRAP_US - 1)).astype(np.int64)
+        # Only a fall of more than half the range is a wrap: a smaller one is an event out of order.
+        wraps = np.cumsum(np.diff(us, prepend=us[:1]) < -_LIBCAER_WRAP_US // 2)
+        t = time_base_ns // 1000 + us + wraps * _LIBCAER_WRAP_US
+        return make_events(data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1, t)
+
+
+class LibcaerCmpDecoder(_Carrying):
+    """`libcaer_cmp`: u16 words, addresses carried over from the packet before."""
+
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Start with no address known; refuse packets of more events than this."""
+        self._max_events = max_events
+        self._state = np.zeros(3, np.int64)
+
+    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+        """See `Decoder.decode`."""
+        words = _words(payload, "libcaer_cmp")
+        out = _room_for(words, 3, {5: 8}, "libcaer_cmp", self._max_events)
+        n = decode_libcaer_cmp(words, time_base_ns // 1000, self._state, out)
+        if n < 0:
+            at = -1 - n
+            raise InputError(f"libcaer_cmp payload: unknown word 0x{words[at]:04x} at byte {2 * at}")
+        return out[:n]
+
+    def resync(self) -> None:
+        """See `Decoder.resync`: a packet begins with its own x."""
+
+
+class Evt3Decoder(_Carrying):
+    """`evt3`, also the words of a Prophesee EVT 3.0 camera file: u16 words, all state carried over.
+
+    Stream time is that of the camera, from its 24-bit microseconds with their wraps counted; `time_base` is
+    not used. Events before the first TIME_HIGH, TIME_LOW and ADDR_Y, in this order, are skipped.
+    """
+
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Start with nothing seen; refuse packets of more events than this."""
+        self._max_events = max_events
+        self._state = np.zeros(6, np.int64)
+
+    def decode(self, payload: bytes | memoryview, time_base_ns: int = 0) -> Events:
+        """See `Decoder.decode`."""
+        words = _words(payload, "evt3")
+        out = _room_for(words, 0x2, {0x4: 12, 0x5: 8}, "evt3", self._max_events)
+        return out[: decode_evt3(words, self._state, out)]
+
+    def resync(self) -> None:
+        """See `Decoder.resync`: wait for time and address again; the wraps counted so far stay."""
+        self._state[-1] = 0
+
+    def count_wraps(self, n: int) -> None:
+        """Time has wrapped so often more than the packets that were decoded could show."""
+        self._state[0] += n << 12
+
+
+_DECODERS: dict[str, Callable[[int], Decoder]] = {
+    "mono": MonoDecoder,
+    "libcaer": LibcaerDecoder,
+    "libcaer_cmp": LibcaerCmpDecoder,
+    "evt3": Evt3Decoder,
+}
+
+PAYLOAD_ENCODINGS = tuple(_DECODERS)
+"""The names that `make_decoder` and `encode` take."""
+
+
+def make_decoder(encoding: str, max_events: int = MAX_PACKET_EVENTS) -> Decoder:
+    """Make the decoder of one topic, which refuses packets of more than `max_events` events.
+
+    Raises:
+        InputError: the encoding is none of `PAYLOAD_ENCODINGS`.
+    """
+    if encoding not in _DECODERS:
+        raise InputError(
+            f"unknown event encoding {encoding[:40]!r}; known are {', '.join(PAYLOAD_ENCODINGS)}"
+        )
+    return _DECODERS[encoding](max_events)
+
+
+def encode(events: Events, encoding: str, after_us: int = 0) -> tuple[bytes, int]:
+    """Encode the events of one packet.
+
+    Args:
+        events: `(n,)` array of `EVENT_DTYPE`, not changed; for `libcaer` and `evt3` sorted by time.
+        encoding: one of `PAYLOAD_ENCODINGS`.
+        after_us: `evt3` only: time of the last event that the reader of this packet has decoded, 0 at the
+            start of a stream; silent gaps after it are bridged with TIME_HIGH words.
+
+    Returns:
+        The payload, and the `time_base` in nanoseconds that belongs to it.
+
+    Raises:
+        InputError: the encoding is unknown, or cannot represent these events: a coordinate has too many
+            bits, a polarity is not 0 or 1, time is negative, out of order, or spans too much for a packet.
+    """
+    make_decoder(encoding)
+    if len(events) == 0:
+        return b"", 0
+    _check_fields(events, encoding)
+    if encoding == "evt3":
+        return _encode_evt3(events, after_us), 0
+    first_us = int(events["t"].min())
+    offset_us = events["t"] - first_us
+    if encoding == "mono":
+        _check_span(offset_us, ((1 << 32) - 1) // 1000, "mono")
+        x, y, p, dt_ns = (c.astype("<u8") for c in (events["x"], events["y"], events["p"], offset_us * 1000))
+        payload = dt_ns | x << 32 | y << 48 | p << 63
+    elif encoding == "libcaer":
+        _check_sorted(events, "libcaer")
+        _check_span(offset_us, _LIBCAER_WRAP_US - 1, "libcaer")
+        x, y, p = (events[name].astype("<u4") for name in ("x", "y", "p"))
+        payload = np.empty(len(events), _LIBCAER)
+        payload["data"] = x << 17 | y << 2 | p << 1 | 1  # bit 0: libcaer's mark of a valid event
+        payload["us"] = offset_us
+    else:
+        _check_span(offset_us, (1 << 24) - 1, "libcaer_cmp")
+        payload = _libcaer_cmp_words(events, offset_us)
+    return payload.tobytes(), first_us * 1000
+
+
+_Record = TypeVar("_Record", bound=np.generic)
+
+
+def _records(
+    payload: bytes | memoryview, dtype: np.dtype[_Record], encoding: str, limit: int
+) -> NDArray[_Record]:
+    """View a payload as whole records."""
+    if len(payload) % dtype.itemsize:
+        raise InputError(
+            f"{encoding} payload: {len(payload)} bytes are not a multiple of {dtype.itemsize}; "
+            "the packet is cut short or of another encoding"
+        )
+    records = np.frombuffer(payload, dtype)
+    _check_count(len(records), limit, encoding)
+    return records
+
+
+def _words(payload: bytes | memoryview, encoding: str) -> _Words:
+    """Copy a payload out, so that a kernel meets one array type, whatever address the bytes had."""
+    return _records(payload, np.dtype(np.uint16), encoding, MAX_PACKET_EVENTS).copy()
+
+
+def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str, limit: int) -> Events:
+    """Allocate for all events that these words can hold.
+
+    Args:
+        words: `(n,)`, type in the top four bits.
+        single: the type that is one event.
+        vectors: the types that are one event per set bit, with how many bits count.
+        encoding: named in the error.
+        limit: how many are too many.
+    """
+    kind = words >> 12
+    n = int(np.count_nonzero(kind == single))
+    for code, width in vectors.items():
+        n += int(np.bitwise_count(words[kind == code] & ((1 << width) - 1)).sum(dtype=np.int64))
+    _check_count(n, limit, encoding)
+    return np.zeros(n, EVENT_DTYPE)
+
+
+def _check_count(n: int, limit: int, encoding: str) -> None:
+    if n > limit:
+        raise InputError(f"{encoding} payload: {n} records or events in one packet, more than {limit}")
+
+
+_ADDRESS_BITS = {"mono": (16, 15), "libcaer": (15, 15), "libcaer_cmp": (11, 11), "evt3": (11, 11)}
+
+
+def _check_fields(events: Events, encoding: str) -> None:
+    for name, bits in zip("xy", _ADDRESS_BITS[encoding], strict=True):
+        largest = int(events[name].max())
+        if largest >> bits:
+            raise InputError(f"{encoding} has {bits} bits for {name}, but an event has {name} = {largest}")
+    if ((events["p"] != 0) & (events["p"] != 1)).any():
+        raise InputError(f"{encoding} needs polarities of 0 and 1; map other values before writing")
+    if events["t"].min() < 0:
+        raise InputError(f"{encoding} has no negative time, but an event has t = {events['t'].min()} us")
+
+
+def _check_sorted(events: Events, encoding: str) -> None:
+    falls = np.flatnonzero(np.diff(events["t"]) < 0)
+    if len(falls):
+        raise InputError(
+            f"{encoding} needs events in order of time, but event {falls[0] + 1} is earlier than the one "
+            "before it; sort them, or write mono"
+        )
+
+
+def _check_span(offset_us: NDArray[np.int64], limit_us: int, encoding: str) -> None:
+    if offset_us.max() > limit_us:
+        raise InputError(
+            f"a {encoding} packet spans at most {limit_us} us, these events {offset_us.max()} us; "
+            "write them as several packets"
+        )
+
+
+def _changed(column: NDArray[np.int64], before: int) -> NDArray[np.bool_]:
+    """Mark the entries that differ from the one before."""
+    changed: NDArray[np.bool_] = np.diff(column, prepend=before) != 0
+    return changed
+
+
+def _libcaer_cmp_words(events: Events, offset_us: NDArray[np.int64]) -> _Words:
+    """Words TIME_HIGH, TIME_LOW and X where they change, and Y for every event."""
+    high, low, x = offset_us >> 12, offset_us & 0xFFF, events["x"].astype(np.int64)
+    y = events["y"] | events["p"].astype(np.uint16) << 11
+    words = np.stack([high, 0x1000 | low, 0x2000 | x, 0x3000 | y], axis=1).astype("<u2")
+    keep = np.stack([_changed(high, 0), _changed(low, 0), _changed(x, -1), np.ones(len(x), bool)], axis=1)
+    kept: _Words = words[keep]
+    return kept
+
+
+def _encode_evt3(events: Events, after_us: int) -> bytes:
+    """Words TIME_HIGH, TIME_LOW and ADDR_Y where they change, and ADDR_X for every event."""
+    _check_sorted(events, "evt3")
+    t, y = events["t"], events["y"].astype(np.int64)
+    if t[0] < after_us:
+        raise InputError(f"evt3 needs events in order of time, but {t[0]} us follows {after_us} us")
+    high, low = t >> 12, t & 0xFFF
+    x = events["x"] | events["p"].astype(np.uint16) << 11
+    words = np.stack([0x8000 | high & 0xFFF, 0x6000 | low, y, 0x2000 | x], axis=1).astype("<u2")
+    keep = np.stack([_changed(high, -1), _changed(low, -1), _changed(y, -1), np.ones(len(y), bool)], axis=1)
+    # A packet can be read on its own when it starts with both times; bridges stand in front of their event.
+    steps = np.diff(high, prepend=after_us >> 12)
+    pieces, done = [], 0
+    for gap in np.flatnonzero(steps > _EVT3_MAX_STEP):
+        pieces += [words[done:gap][keep[done:gap]], _evt3_bridge(int(high[gap] - steps[gap]), int(high[gap]))]
+        done = int(gap)
+    pieces.append(words[done:][keep[done:]])
+    return np.concatenate(pieces).tobytes()
+
+
+def _evt3_bridge(start: int, stop: int) -> _Words:
+    """TIME_HIGH words from `start` towards `stop` in steps that count every wrap."""
+    if stop - start > _EVT3_MAX_STEP * _EVT3_MAX_BRIDGE:
+        raise InputError(
+            f"evt3 has 24-bit time and cannot jump from {start << 12} to {stop << 12} us; "
+            "subtract an offset from all times, or write mono"
+        )
+    bridge: NDArray[np.int64] = np.arange(start, stop, _EVT3_MAX_STEP)
+    words: _Words = (0x8000 | bridge & 0xFFF).astype("<u2")
+    return words

@@ -1,0 +1,241 @@
+"""What a stream is made of: packets of events, labels, and time that passes in silence.
+
+Lives here: `Packet`, `Label`, `Watermark`, and the way between packets and the messages that carry them.
+Not here: where messages come from (`recording`, `live`), what bytes they have (`messages`, `codecs`).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+from streamfeat.files.json_fields import Fields
+from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
+from streamfeat.messages.codecs import (
+    EVT3_WRAP_US,
+    MAX_PACKET_EVENTS,
+    PAYLOAD_ENCODINGS,
+    Decoder,
+    Evt3Decoder,
+    encode,
+    make_decoder,
+)
+
+__all__ = ["EVENT_SCHEMAS", "MAX_PIXELS", "Label", "Packet", "PacketReader", "PacketWriter", "Watermark"]
+
+EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
+"""Messages that carry events."""
+
+PACKET_EVENTS = 8192
+PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
+_MOST_WRAPS = 86_400_000_000 // EVT3_WRAP_US  # in a day
+_MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
+MAX_PIXELS = 1 << 22
+"""Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Packet:
+    """One message of events.
+
+    Attributes:
+        topic: where it was published.
+        events: `(n,)` EVENT_DTYPE; n may be 0.
+        resolution: `(height, width)` of the sensor.
+        log_time_ns: when it was recorded or received.
+        seq: its number at the source.
+        source_ns: when it was published, by the publisher's clock; 0 when nobody said.
+        lost: packets known to be missing between the one before and this one.
+        epoch: counts how often the camera's clock started anew; times of two epochs cannot be compared.
+    """
+
+    topic: str
+    events: Events
+    resolution: Resolution
+    log_time_ns: int
+    seq: int
+    source_ns: int = 0
+    lost: int = 0
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Watermark:
+    """Stream time of a silent `topic`: nothing older than `t_us` is expected any more."""
+
+    topic: str
+    t_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A labelled sample: the events in `[start_us, start_us + duration_us)`, of `topic` if it names one."""
+
+    start_us: int
+    duration_us: int
+    label: str
+    split: str = ""
+    source: str = ""
+    topic: str = ""
+
+    @classmethod
+    def from_cdr(cls, data: bytes | memoryview, topic: str = "") -> Self:
+        """Read a `streamfeat_msgs/msg/Label`.
+
+        Raises:
+            InputError: the bytes are no such message.
+        """
+        m = LabelMessage.from_cdr(data)
+        return cls(m.stamp_ns // 1000, m.duration_ns // 1000, m.label, m.split, m.source, topic)
+
+
+class PacketReader:
+    """Turns the event messages of one topic into packets; keeps what decoders carry from one to the next.
+
+    `encoding` is that of the latest message, `time_us` the time it gave for itself, None where it has none.
+
+    Args:
+        topic: named in the packets.
+        max_events: packets of more events are refused.
+    """
+
+    def __init__(self, topic: str, max_events: int = MAX_PACKET_EVENTS) -> None:
+        """Start with no decoder."""
+        self.encoding = ""
+        self.time_us: int | None = None
+        self._topic = topic
+        self._max_events = max_events
+        self._decoders: dict[str, Decoder] = {}
+        self._last_seq: int | None = None
+        self._is_broken = False
+        self._before: tuple[int, int] | None = None
+
+    def read(self, schema: str, data: bytes | memoryview, log_time_ns: int, sequence: int) -> Packet:
+        """Read one message; `sequence` stands in where the message has no number of its own.
+
+        Raises:
+            InputError: the bytes are no such message, or its payload is not what it says.
+        """
+        if schema == EventArray.SCHEMA_NAME:
+            array = EventArray.from_cdr(data)
+            self.encoding, self.time_us = "dvs_msgs", None
+            resolution = _resolution(array.height, array.width)
+            return Packet(self._topic, array.events, resolution, log_time_ns, sequence)
+        packet = EventPacket.from_cdr(data)
+        if self._last_seq is not None and packet.seq > self._last_seq + 1:
+            self.resync()
+        self._last_seq = packet.seq
+        if packet.is_bigendian:
+            raise InputError("big-endian payloads are not supported; record with is_bigendian false")
+        resolution = _resolution(packet.height, packet.width)
+        if packet.encoding not in self._decoders:
+            self._decoders[packet.encoding] = make_decoder(packet.encoding, self._max_events)
+        decoder = self._decoders[packet.encoding]
+        events = decoder.decode(packet.events, packet.time_base)
+        if isinstance(decoder, Evt3Decoder) and len(events):
+            self._place(decoder, events, packet.stamp_ns)
+        self.encoding = packet.encoding
+        # The times of evt3 are the camera's own; its time_base is on another clock.
+        timed = packet.time_base and packet.encoding != "evt3"
+        self.time_us = packet.time_base // 1000 if timed else None
+        return Packet(self._topic, events, resolution, log_time_ns, packet.seq)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What decoders carry on, as JSON values."""
+        return {
+            "last_seq": self._last_seq,
+            "is_broken": self._is_broken,
+            "before": self._before,
+            "decoders": {name: decoder.snapshot() for name, decoder in self._decoders.items()},
+        }
+
+    def restore(self, values: Fields) -> None:
+        """Go on from a snapshot.
+
+        Raises:
+            InputError: it is none.
+        """
+        self._last_seq = values.maybe("last_seq", 0, 1 << 64)
+        self._is_broken = values.flag("is_broken")
+        before = values.wholes("before", 2) if "before" in values else []
+        self._before = (before[0], before[1]) if len(before) == 2 else None
+        decoders = values.inner("decoders")
+        for name in PAYLOAD_ENCODINGS:
+            if name in decoders:
+                self._decoders[name] = make_decoder(name, self._max_events)
+                self._decoders[name].restore(decoders.wholes(name, 8))
+
+    def _place(self, decoder: Evt3Decoder, events: Events, stamp_ns: int) -> None:
+        """After missing packets, count the wraps of 16.8 s that they would have shown, by the stamps around.
+
+        Args:
+            decoder: of the packet, changed.
+            events: of the packet, at least one, changed.
+            stamp_ns: of the packet.
+        """
+        if self._is_broken and self._before:
+            stamp_before_ns, last_us = self._before
+            expected_us = last_us + (stamp_ns - stamp_before_ns) // 1000
+            wraps = round((expected_us - int(events["t"][0])) / EVT3_WRAP_US)
+            if 0 < wraps <= _MOST_WRAPS:
+                decoder.count_wraps(wraps)
+                events["t"] += wraps * EVT3_WRAP_US
+        self._is_broken = False
+        self._before = stamp_ns, int(events["t"][-1])
+
+    def resync(self) -> None:
+        """Messages are missing: what came before says nothing about what follows."""
+        self._is_broken = True
+        for decoder in self._decoders.values():
+            decoder.resync()
+
+
+class PacketWriter:
+    """Cuts the events of one topic into messages, numbered from 0.
+
+    Args:
+        encoding: of the payloads, one of `streamfeat.messages.codecs.PAYLOAD_ENCODINGS`.
+        frame_id: in the header of every message.
+
+    Raises:
+        InputError: the encoding is unknown.
+    """
+
+    def __init__(self, encoding: str = "mono", frame_id: str = "") -> None:
+        """Nothing written yet."""
+        make_decoder(encoding)
+        self._encoding, self._frame_id = encoding, frame_id
+        self._seq = 0
+        self._after_us = 0
+
+    def messages(self, events: Events, resolution: Resolution) -> Iterator[EventPacket]:
+        """Yield a batch as messages, each with the time of its earliest event as its stamp.
+
+        Args:
+            events: `(n,)` array of `EVENT_DTYPE`, not changed; n may be 0, which yields nothing.
+            resolution: `(height, width)` of the sensor.
+
+        Raises:
+            InputError: the encoding cannot represent the events (see `streamfeat.messages.codecs.encode`).
+        """
+        start = 0
+        height, width = resolution
+        while start < len(events):
+            block = events[start : start + PACKET_EVENTS]
+            far = np.flatnonzero(np.abs(block["t"] - block["t"][0]) >= PACKET_US)
+            block = block[: far[0]] if len(far) else block
+            payload, base_ns = encode(block, self._encoding, self._after_us)
+            stamp_ns, about = int(block["t"].min()) * 1000, (self._frame_id, height, width)
+            yield EventPacket(stamp_ns, *about, self._seq, base_ns, self._encoding, False, payload)
+            self._seq += 1
+            self._after_us = int(block["t"][-1])
+            start += len(block)
+
+
+def _resolution(height: int, width: int) -> Resolution:
+    if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE):
+        raise InputError(f"a sensor of height {height} and width {width} is not possible")
+    return height, width

@@ -1,0 +1,378 @@
+"""Reading recordings: batches, packets, labels and labelled samples out of an MCAP file.
+
+Lives here: `open_recording` and what it gives; choosing the topic, decoding, counting.
+Not here: the file format and its damage (`records`), messages (`streamfeat.messages`), writing (`writer`).
+
+A recording is read in file order with one packet in memory at a time. What cannot be read is skipped and
+counted in `Recording.losses`; only a recording that yields nothing at all is an error.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from os import PathLike
+from types import TracebackType
+from typing import BinaryIO, Self
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+from streamfeat.files.locations import Location, StoreLocation, absolute, location_of
+from streamfeat.messages.cdr import LabelMessage
+from streamfeat.messages.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.recordings.records import (
+    Losses,
+    Summary,
+    count_missing,
+    iter_messages,
+    iter_records,
+    open_mcap,
+    read_summary,
+)
+from streamfeat.recordings.samples import Sample, complete_samples
+
+__all__ = [
+    "HELD_OUT_SPLITS",
+    "WHOLE",
+    "Label",
+    "Losses",
+    "Packet",
+    "Part",
+    "Recording",
+    "Sample",
+    "Topic",
+    "open_recording",
+]
+
+_LOOP_GAP_US = 1_000_000
+
+_PART_BYTES = 1 << 20
+_MOST_PARTS = 1000
+
+HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
+"""Splits that nothing is learned from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a recording."""
+
+    name: str
+    schema: str
+    schema_encoding: str
+    n_messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Some chunks of a recording, from byte `start` to byte `end`.
+
+    Where there are labels it begins with the first in those chunks and reaches to the first behind them, so
+    that the parts of a recording hold each label and its events once, whichever chunk these are in.
+    """
+
+    start: int
+    end: float
+
+
+WHOLE = Part(0, math.inf)
+"""All of a recording."""
+
+
+@dataclass(slots=True)
+class _Totals:
+    """What only a full pass can tell."""
+
+    labels: list[Label] = field(default_factory=list)
+    n_on: int = 0
+    n_off: int = 0
+    first_us: int | None = None
+    last_us: int | None = None
+
+    def add(self, events: Events) -> None:
+        if len(events) == 0:
+            return
+        on = int(np.count_nonzero(events["p"]))
+        self.n_on += on
+        self.n_off += len(events) - on
+        first, last = int(events["t"].min()), int(events["t"].max())
+        self.first_us = first if self.first_us is None else min(first, self.first_us)
+        self.last_us = last if self.last_us is None else max(last, self.last_us)
+
+
+def open_recording(path: str | PathLike[str] | StoreLocation, topic: str | None = None) -> "Recording":
+    """Open an MCAP recording of events.
+
+    Args:
+        path: the file; text that is a URL means a file in a store, see `streamfeat.files.locations`.
+        topic: the event topic to read; may be left out when there is only one.
+
+    Raises:
+        InputError: the file is missing, empty or no MCAP; it has no event topic, several and none was
+            chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
+            it, too, where a store refuses or goes away.
+    """
+    return Recording(path, topic)
+
+
+class Recording:
+    """A recording of events, read in file order; iterate as often as you like.
+
+    `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass
+    (an iteration, or the first use of a count) could not read.
+    """
+
+    path: Location
+    topics: list[Topic]
+    topic: str
+    resolution: Resolution
+    encoding: str
+    losses: Losses
+
+    def __init__(
+        self, path: str | PathLike[str] | StoreLocation, topic: str | None = None, part: Part = WHOLE
+    ) -> None:
+        """See `open_recording`."""
+        self.path = location_of(path)
+        self._part = part
+        self._file = open_mcap(self.path)
+        try:
+            summary = read_summary(self._file)
+            # Counts from a summary tell what should be there; a scan can only tell what is.
+            self._has_summary = summary is not None
+            self._known = summary or _scan(self._file)
+            self.topics = _topics(self._known)
+            self.topic = _choose_topic(
+                self.path, [t for t in self.topics if t.schema in EVENT_SCHEMAS], topic
+            )
+            self.encoding = ""
+            self.resolution = self._first_packet().resolution
+            self.losses = Losses()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        """Give the recording itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; iterating after that is an error."""
+        self._file.close()
+
+    def __iter__(self) -> Iterator[Events]:
+        """Yield batches of events in stored order: `(n,)` arrays of `EVENT_DTYPE`, n > 0."""
+        for item in self.items():
+            if isinstance(item, Packet) and len(item.events):
+                yield item.events
+
+    @property
+    def is_labelled(self) -> bool:
+        """Whether there may be labels."""
+        return any(topic.schema == LabelMessage.SCHEMA_NAME for topic in self.topics)
+
+    def parts(self) -> list[Part]:
+        """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
+
+        They depend on the file alone. There is but one where the file does not tell where its chunks are, or
+        where packets cannot be read without those before them (evt3).
+        """
+        starts = sorted(self._known.chunk_starts) if self.encoding != "evt3" else []
+        cuts = [0]
+        for start in starts:
+            if start >= cuts[-1] + max(_PART_BYTES, starts[-1] // _MOST_PARTS):
+                cuts.append(start)
+        return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
+
+    def part(self, part: Part) -> Callable[[], "Recording"]:
+        """What opens some of this recording, wherever that is called, and can be pickled."""
+        return partial(Recording, absolute(self.path), self.topic, part)
+
+    def items(self) -> Iterator[Packet | Label]:
+        """Yield packets and labels in stored order; a label comes before its first packet."""
+        is_labelled = self.is_labelled
+        has_begun = self._part.start == 0 or not is_labelled
+        for at, item in self.placed_items(self._part):
+            is_cut = isinstance(item, Label) or not is_labelled
+            if at >= self._part.end and is_cut:
+                return
+            has_begun = has_begun or is_cut
+            if has_begun:
+                yield item
+
+    def placed_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
+        """Yield packets and labels in stored order, each with the byte of its chunk, to the end of the file.
+
+        Args:
+            part: where to begin; what is lost behind it is not counted.
+        """
+        losses = self.losses = Losses()
+        reader = PacketReader(self.topic)
+        seen: Counter[int] = Counter()
+        for at, channel, schema, message in iter_messages(
+            self._file, self._known, losses, part.start, part.end
+        ):
+            if at >= part.end:
+                losses = Losses()
+            is_label = schema.name == LabelMessage.SCHEMA_NAME
+            if not is_label and (channel.topic != self.topic or schema.name not in EVENT_SCHEMAS):
+                continue
+            seen[channel.id] += 1
+            item: Packet | Label
+            try:
+                if is_label:
+                    item = Label.from_cdr(message.data)
+                else:
+                    item = reader.read(schema.name, message.data, message.log_time, message.sequence)
+                    self._check_size(item)
+                    self.encoding = self.encoding or reader.encoding
+            except InputError as error:
+                where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
+                losses.add("bad label" if is_label else "bad packet", len(message.data), where)
+            else:
+                yield at, item
+        promised = self._known.channels if self._has_summary and part == WHOLE else {}
+        for channel_id, channel in promised.items():
+            kind = self._known.schemas.get(channel.schema_id)
+            if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
+                count_missing(self._known, channel_id, seen[channel_id], losses)
+
+    def played(
+        self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
+    ) -> Iterator[Packet | Label]:
+        """As `items`, and with `loop` again and again, a second after the end, with times that go on.
+
+        Args:
+            loop: go on for ever.
+            report: told, with each item of the first time, how many there have been and how many there are;
+                0 if that is unknown.
+        """
+        wanted = {*EVENT_SCHEMAS, LabelMessage.SCHEMA_NAME}
+        topics = [t for t in self.topics if t.schema in wanted]
+        total = sum(t.n_messages for t in topics if t.name == self.topic or t.schema not in EVENT_SCHEMAS)
+        for done, item in enumerate(self.items(), 1):
+            yield item
+            report(done, 0 if loop else total)
+        if not loop or self.first_us is None or self.last_us is None:
+            return
+        step_us = self.last_us - self.first_us + _LOOP_GAP_US
+        shift_us = 0
+        while True:
+            shift_us += step_us
+            for item in self.items():
+                if isinstance(item, Packet):
+                    events = item.events.copy()
+                    events["t"] += shift_us
+                    yield replace(item, events=events)
+                else:
+                    yield replace(item, start_us=item.start_us + shift_us)
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the labelled samples in stored order; those of a part to their end, wherever that is.
+
+        When a sample is complete, and what memory that takes: see `complete_samples`.
+        """
+        return complete_samples(self.placed_items(self._part), self._part.end, self.resolution)
+
+    @cached_property
+    def _totals(self) -> _Totals:
+        totals = _Totals()
+        for item in self.items():
+            if isinstance(item, Label):
+                totals.labels.append(item)
+            else:
+                totals.add(item.events)
+        return totals
+
+    @property
+    def labels(self) -> list[Label]:
+        """All labels in stored order; the first use reads the whole file, as for the counts below."""
+        return self._totals.labels
+
+    @property
+    def n_on(self) -> int:
+        """Number of ON events."""
+        return self._totals.n_on
+
+    @property
+    def n_off(self) -> int:
+        """Number of OFF events."""
+        return self._totals.n_off
+
+    @property
+    def n_events(self) -> int:
+        """Number of events."""
+        return self.n_on + self.n_off
+
+    @property
+    def first_us(self) -> int | None:
+        """Time of the earliest event, or None without events."""
+        return self._totals.first_us
+
+    @property
+    def last_us(self) -> int | None:
+        """Time of the latest event, or None without events."""
+        return self._totals.last_us
+
+    @property
+    def duration_us(self) -> int:
+        """Time from the earliest to the latest event."""
+        return (self.last_us or 0) - (self.first_us or 0)
+
+    @staticmethod
+    def _check_size(packet: Packet) -> None:
+        height, width = packet.resolution
+        if height * width > MAX_PIXELS:
+            raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
+
+    def _first_packet(self) -> Packet:
+        for _, item in self.placed_items(WHOLE):
+            if isinstance(item, Packet):
+                return item
+        reasons = list(self.losses.first.values()) or ["it has no messages"]
+        raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
+
+
+def _scan(file: BinaryIO) -> Summary:
+    """Build what a summary would say, from the records that are there."""
+    found, counts = Summary(), Counter[int]()
+    for _, record in iter_records(file, Losses()):
+        if isinstance(record, Channel):
+            found.channels[record.id] = record
+        elif isinstance(record, Schema):
+            found.schemas[record.id] = record
+        else:
+            counts[record.channel_id] += 1
+    found.message_counts = dict(counts)
+    return found
+
+
+def _topics(known: Summary) -> list[Topic]:
+    """List the topics; several channels of one topic and schema are one."""
+    counts: dict[tuple[str, str, str], int] = {}
+    for channel in known.channels.values():
+        schema = known.schemas.get(channel.schema_id)
+        key = (channel.topic, schema.name if schema else "", schema.encoding if schema else "")
+        counts[key] = counts.get(key, 0) + known.message_counts.get(channel.id, 0)
+    return [Topic(*key, n_messages=n) for key, n in counts.items()]
+
+
+def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
+    names = sorted({t.name for t in topics if t.schema in EVENT_SCHEMAS})
+    if not names:
+        raise InputError(f"{path}: no topic carries {' or '.join(EVENT_SCHEMAS)}; is this the right file?")
+    if wanted is None and len(names) > 1:
+        raise InputError(f"{path}: several topics carry events, choose one of {names}")
+    if wanted is not None and wanted not in names:
+        raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
+    return wanted or names[0]

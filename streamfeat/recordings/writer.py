@@ -1,0 +1,310 @@
+"""Writing recordings: events, labels, features and predictions into an MCAP file.
+
+Lives here: `RecordingWriter`; cutting batches into packets, and never leaving half a file in place; and
+`recover`, which copies what can be read of a damaged file.
+Not here: reading (`streamfeat.recordings.reader`), what bytes a message has (`streamfeat.messages.cdr`).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from mcap.records import Channel, Message, Schema
+from mcap.writer import CompressionType, Writer
+from numpy.typing import ArrayLike
+
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution, as_events
+from streamfeat.files.locations import StoreLocation, location_of
+from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
+from streamfeat.messages.packets import Label, PacketWriter
+from streamfeat.recordings.records import Losses, count_missing, iter_messages, open_mcap, read_summary
+
+__all__ = ["RecordingWriter", "recover"]
+
+_COMPRESSION = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+_MAX_CHANNELS = (1 << 16) - 1  # of a file, as the mcap package numbers them
+
+_Message = EventPacket | LabelMessage | FeaturesMessage | PredictionMessage
+
+
+def recover(
+    source: str | PathLike[str] | StoreLocation,
+    target: str | PathLike[str],
+    *,
+    overwrite: bool = False,
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
+) -> Losses:
+    """Copy every message of any topic that can be read into a new, intact recording.
+
+    Args:
+        source: the damaged or unfinished file, not changed.
+        target: the file to write.
+        overwrite: whether an existing file at `target` may be replaced.
+        report: called with (step, messages, of how many, remark) after each message; of how many is 0 where
+            the source does not say.
+
+    Returns:
+        What could not be read.
+
+    Raises:
+        InputError: `source` is no MCAP file at all, or `target` exists or cannot be written.
+    """
+    losses, copied = Losses(), Counter[int]()
+    # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
+    writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
+    with writer, open_mcap(location_of(source)) as file:
+        summary = read_summary(file)
+        total = sum(summary.message_counts.values()) if summary else 0
+        for done, (_, channel, schema, message) in enumerate(iter_messages(file, summary, losses), 1):
+            writer._copy(channel, schema, message)
+            copied[channel.id] += 1
+            report("recovering", done, total, "")
+    for channel_id in summary.message_counts if summary else ():
+        count_missing(summary, channel_id, copied[channel_id], losses)
+    return losses
+
+
+class RecordingWriter:
+    """Write one recording; a context manager.
+
+    Everything goes to `<path>.part` first, so that `path` is a whole recording or not there. Leaving the
+    block renames it to `path`; leaving it with an exception removes it, or leaves it for
+    `streamfeat recover` when `keep_partial` is set. An existing file at `path` is untouched until then.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        *,
+        encoding: str = "mono",
+        compression: Literal["zstd", "lz4", "none"] = "zstd",
+        event_topic: str = "/events",
+        frame_id: str = "",
+        overwrite: bool = False,
+        keep_partial: bool = False,
+        part_suffix: str = ".part",
+        chunk_size: int = 1 << 20,
+    ) -> None:
+        """Open the temporary file.
+
+        Args:
+            path: the file to write.
+            encoding: of event payloads, one of `streamfeat.messages.codecs.PAYLOAD_ENCODINGS`.
+            compression: of chunks.
+            event_topic: topic of the events; labels, features and predictions go to `/label`, `/features`
+                and `/prediction`.
+            frame_id: frame in the header of every message.
+            overwrite: whether an existing file at `path` may be replaced.
+            keep_partial: whether an exception leaves what was written so far.
+            part_suffix: what the name of the temporary file has after `path`.
+            chunk_size: bytes before compression that one damaged spot in the file can cost.
+
+        Raises:
+            InputError: the encoding or compression is unknown, or the file exists or cannot be written.
+        """
+        if compression not in _COMPRESSION:
+            raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
+        self.path = Path(path)
+        self._part = self.path.with_name(self.path.name + part_suffix)
+        self._overwrite, self._keep_partial = overwrite, keep_partial
+        self._event_topic, self._frame_id = event_topic, frame_id
+        self._packets = PacketWriter(encoding, frame_id)
+        self._channels: dict[str | int, int] = {}
+        self._schemas: dict[int, int] = {}
+        self._check_target()
+        try:
+            self._file = self._part.open("xb")
+        except FileExistsError:
+            raise InputError(
+                f"{self._part}: left by a writer that did not finish, or is still at work; save it with "
+                f"`streamfeat recover`, or delete it"
+            ) from None
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self._writer = Writer(self._file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
+        self._writer.start(profile="ros2", library="streamfeat")
+
+    def __enter__(self) -> Self:
+        """Give the writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finish the file and move it into place, or drop it after an exception."""
+        if kind is None:
+            self.close()
+        else:
+            self._abandon()
+
+    def close(self) -> None:
+        """Finish the file and move it into place; a second call does nothing.
+
+        Raises:
+            InputError: meanwhile a file appeared at `path` and `overwrite` is not set.
+        """
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+            self._check_target()
+            self._part.replace(self.path)
+        except OSError as error:
+            self._abandon()
+            raise self._unwritable(error) from None
+        except BaseException:
+            self._abandon()
+            raise
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system, so that a crash cannot take it.
+
+        Raises:
+            InputError: there is no room for it.
+        """
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def write_events(self, events: Events, resolution: Resolution) -> None:
+        """Write a batch as one or more packets, each at the time of its first event.
+
+        Args:
+            events: `(n,)` array of `EVENT_DTYPE`, not changed, or a structured array of another tool (see
+                `as_events`); n may be 0, which writes nothing.
+            resolution: `(height, width)` of the sensor.
+
+        Raises:
+            InputError: the encoding cannot represent the events (see `codecs.encode`), or a
+                time is negative or 2^31 s or more.
+        """
+        for packet in self._packets.messages(as_events(events), resolution):
+            self._write(self._event_topic, packet)
+
+    def write_label(self, label: Label, topic: str = "/label") -> None:
+        """Write a label; do so before the events it speaks of.
+
+        Raises:
+            InputError: start or duration is out of range.
+        """
+        message = LabelMessage(
+            label.start_us * 1000,
+            self._frame_id,
+            label.duration_us * 1000,
+            label.label,
+            label.split,
+            label.source,
+        )
+        self._write(topic, message)
+
+    def write_features(
+        self, t_us: int, n_events: int, data: ArrayLike, *, incomplete: bool = False, topic: str = "/features"
+    ) -> None:
+        """Write the features at a stream time.
+
+        Args:
+            t_us: stream time, microseconds.
+            n_events: events that went into them.
+            data: `(n,)`, stored as float32, not changed.
+            incomplete: packets are known to be missing from the window.
+            topic: to write to.
+
+        Raises:
+            InputError: the time is out of range.
+        """
+        values = np.asarray(data, np.float32)
+        self._write(topic, FeaturesMessage(t_us * 1000, self._frame_id, n_events, values, incomplete))
+
+    def write_prediction(
+        self, t_us: int, label: str, labels: Sequence[str], scores: ArrayLike, *, topic: str = "/prediction"
+    ) -> None:
+        """Write a prediction at a stream time.
+
+        Args:
+            t_us: stream time, microseconds.
+            label: the winner.
+            labels: all labels.
+            scores: `(len(labels),)`, stored as float32, not changed.
+            topic: to write to.
+
+        Raises:
+            InputError: the time is out of range.
+        """
+        values = np.asarray(scores, np.float32)
+        self._write(topic, PredictionMessage(t_us * 1000, self._frame_id, label, labels, values))
+
+    def write_message(
+        self, topic: str, kind: type[_Message | EventArray], data: bytes, log_time_ns: int, sequence: int
+    ) -> None:
+        """Write a message as it came.
+
+        Args:
+            topic: to write to.
+            kind: its type; that the bytes are of it is not checked.
+            data: the CDR bytes.
+            log_time_ns: when it came, since 1970.
+            sequence: its number, 32 bits.
+        """
+        self._add(self._channel(topic, kind), log_time_ns, data, log_time_ns, sequence)
+
+    def _write(self, topic: str, message: _Message) -> None:
+        data = message.to_cdr()
+        self._add(self._channel(topic, type(message)), message.stamp_ns, data, message.stamp_ns, 0)
+
+    def _channel(self, topic: str, kind: type[_Message | EventArray]) -> int:
+        which = f"{topic} {kind.SCHEMA_NAME}"
+        if which not in self._channels:
+            schema = self._writer.register_schema(kind.SCHEMA_NAME, "ros2msg", kind.SCHEMA.encode())
+            self._channels[which] = self._writer.register_channel(topic, "cdr", schema)
+        return self._channels[which]
+
+    def _copy(self, channel: Channel, schema: Schema, message: Message) -> None:
+        """Write a message of another recording as it is; do not mix with the public ways to write."""
+        if channel.id not in self._channels:
+            if len(self._channels) == _MAX_CHANNELS:
+                raise InputError(f"{self.path}: a recording has at most {_MAX_CHANNELS} channels")
+            if channel.schema_id and channel.schema_id not in self._schemas:
+                self._schemas[channel.schema_id] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            self._channels[channel.id] = self._writer.register_channel(
+                channel.topic,
+                channel.message_encoding,
+                self._schemas.get(channel.schema_id, 0),
+                channel.metadata,
+            )
+        times = message.log_time, message.data, message.publish_time
+        self._add(self._channels[channel.id], *times, message.sequence)
+
+    def _add(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
+        try:
+            self._writer.add_message(channel_id, log_time, data, publish_time, sequence)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> InputError:
+        return InputError(f"{self._part}: cannot be written: {error.strerror}; is there room and permission?")
+
+    def _check_target(self) -> None:
+        if self.path.exists() and not self._overwrite:
+            raise InputError(f"{self.path}: exists already; choose another name or allow to overwrite it")
+
+    def _abandon(self) -> None:
+        # What is still buffered may be what there is no room for.
+        with suppress(OSError):
+            self._file.close()
+        if not self._keep_partial:
+            self._part.unlink(missing_ok=True)

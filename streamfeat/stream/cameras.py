@@ -1,0 +1,139 @@
+"""Several cameras side by side: one session for each topic, made when it appears and released when it leaves.
+
+Lives here: which session an item goes to, how many there may be, and what becomes of one that fails.
+Not here: what a session does (`session`), where items come from (`live`).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+
+from streamfeat.errors import InputError
+from streamfeat.messages.packets import Label, Packet
+from streamfeat.stream.emission import Emission
+from streamfeat.stream.session import Session, StreamItem
+from streamfeat.stream.state import SessionSnapshot, SessionStats
+
+__all__ = ["MAX_CAMERAS", "CameraLeft", "Cameras"]
+
+MAX_CAMERAS = 64
+"""Topics served at a time; each holds an engine."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLeft:
+    """Nobody publishes on a topic any more."""
+
+    topic: str
+
+
+class Cameras:
+    """A session for each topic; takes items of all of them, in any order.
+
+    An item that a session cannot use is refused and counted by reason, and the session starts anew with the
+    next: other cameras do not notice.
+
+    Args:
+        make_session: makes the session of a topic.
+        limit: topics served at a time; packets of more are refused.
+        on_refusal: told topic, reason and error.
+    """
+
+    def __init__(
+        self,
+        make_session: Callable[[str], Session],
+        *,
+        limit: int = MAX_CAMERAS,
+        on_refusal: Callable[[str, str, str], None] = lambda topic, reason, error: None,
+    ) -> None:
+        """Start with no camera."""
+        self._make_session = make_session
+        self._limit = limit
+        self._on_refusal = on_refusal
+        self._sessions: dict[str, Session] = {}
+        self._past = SessionStats()
+        self.refused: Counter[str] = Counter()
+        self.seen = 0
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics that are served, in order of appearance."""
+        return list(self._sessions)
+
+    def stats(self) -> SessionStats:
+        """Totals of all cameras, past and present."""
+        return _sum([self._past, *(session.stats() for session in list(self._sessions.values()))])
+
+    def stats_by_topic(self) -> dict[str, SessionStats]:
+        """What the session of each topic that is served has done."""
+        return {topic: session.stats() for topic, session in list(self._sessions.items())}
+
+    def snapshots(self) -> dict[str, SessionSnapshot]:
+        """What each session needs to go on."""
+        return {topic: session.snapshot() for topic, session in self._sessions.items()}
+
+    def restore(self, topic: str, snapshot: SessionSnapshot) -> None:
+        """Serve a camera as it was served when its snapshot was taken.
+
+        Raises:
+            InputError: no session can go on from there.
+        """
+        session = self._make_session(topic)
+        session.restore(snapshot)
+        self._sessions[topic] = session
+        self.seen += 1
+
+    def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
+        """Hand an item to the session of its topic, and yield what is read on the way."""
+        if isinstance(item, CameraLeft):
+            yield from self._release(item.topic)
+            return
+        session = self._sessions.get(item.topic)
+        if session is None and isinstance(item, Packet | Label):
+            if len(self._sessions) >= self._limit:
+                self._refuse(item.topic, "too many cameras", f"{self._limit} are served already")
+                return
+            session = self._sessions[item.topic] = self._make_session(item.topic)
+            self.seen += 1
+        if session is None:
+            return
+        try:
+            yield from session.process(item)
+        except InputError as error:
+            self._refuse(item.topic, "unusable", str(error))
+            self._past = _sum([self._past, session.stats()])
+            del self._sessions[item.topic]
+
+    def rest(self) -> None:
+        """Let every camera work ahead."""
+        for session in self._sessions.values():
+            session.rest()
+
+    def finish(self) -> Iterator[Emission]:
+        """End every stream."""
+        for topic in self.topics:
+            yield from self._release(topic)
+
+    def _release(self, topic: str) -> Iterator[Emission]:
+        session = self._sessions.get(topic)
+        if session is None:
+            return
+        try:
+            yield from session.finish()
+        finally:
+            self._past = _sum([self._past, session.stats()])
+            del self._sessions[topic]
+
+    def _refuse(self, topic: str, reason: str, error: str) -> None:
+        self.refused[reason] += 1
+        self._on_refusal(topic, reason, error)
+
+
+def _sum(parts: list[SessionStats]) -> SessionStats:
+    total = SessionStats()
+    for part in parts:
+        for field in fields(SessionStats):
+            one, more = getattr(total, field.name), getattr(part, field.name)
+            if more is not None:
+                setattr(total, field.name, (one or 0) + more)
+    return total

@@ -1,0 +1,394 @@
+"""From the items of a stream to emissions, one item at a time and synchronously.
+
+Lives here: which engine an event goes to, where labelled samples begin and end, when features are read,
+predicting and, on request, learning from labels.
+Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, where one is needed, is given.
+"""
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.engine.encoder import Encoder
+from streamfeat.engine.engine import Engine
+from streamfeat.events import Events, Resolution
+from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.messages.packets import Label, Packet, Watermark
+from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
+
+__all__ = ["Session", "StreamItem"]
+
+StreamItem = Packet | Label | Watermark
+
+_TRACE = 32
+"""Events whose features are held at a time under `event`."""
+_AHEAD_COLUMNS = 4096
+"""Operator columns that are added at most to look ahead of a bin boundary: a fraction of a millisecond."""
+_AUTO_REST = 4.0
+"""Under `auto`, time that passes after a reading, in multiples of what that reading took."""
+
+
+class Session:
+    """Feeds one camera's packets and labels to an engine, and reads it as the policy says.
+
+    A labelled sample starts with an empty window and its own origin, so its features are those of the
+    offline path. Packets of another resolution start a new engine, packets of another epoch an empty window.
+    Whoever is behind reads as `auto` does until it has caught up, whatever the policy: events are not dropped
+    for readings. Readings of a window that packets are missing from are marked.
+
+    Args:
+        encoder: the frozen encoder.
+        policy: when to read.
+        classifier: predicts from each reading.
+        learn_online: learn from each labelled sample after predicting it (prequential).
+        clock: seconds, monotonic; used by the `auto` policy and by those who are behind.
+        topic: named in emissions.
+        is_behind: tells from `log_time_ns` of the packet in hand whether it has waited too long.
+        engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
+
+    Raises:
+        InputError: the classifier does not fit the encoder.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        policy: EmitPolicy,
+        classifier: Classifier | None = None,
+        *,
+        learn_online: bool = False,
+        clock: Callable[[], float] = lambda: 0.0,
+        topic: str = "",
+        is_behind: Callable[[int], bool] = lambda log_time_ns: False,
+        engine: Callable[..., Engine] = Engine,
+    ) -> None:
+        """Check that the parts fit; the engine comes with the first packet."""
+        if classifier:
+            classifier.check_fits(encoder)
+        self.encoder = encoder
+        self.policy = policy
+        self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
+        self._classifier = classifier
+        self._clock = clock
+        self._topic = topic
+        self._window_us = encoder.geometry.window_us
+        self._is_behind = is_behind
+        self._make_engine = engine
+        self._every_event = policy == EmitPolicy("events", 1)
+        self._engine: Engine | None = None
+        every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
+        self._state = SessionState(every_us=every_us)
+        self._rest_until = self._ahead_from = 0.0
+        self._log_time_ns = 0
+        self._source_ns = 0
+        self._stats = SessionStats(correct=0 if classifier else None)
+
+    @property
+    def classifier(self) -> Classifier | None:
+        """The classifier as it is now."""
+        return self.learner.classifier if self.learner else self._classifier
+
+    def stats(self) -> SessionStats:
+        """What has been done so far, a copy."""
+        total = replace(self._stats)
+        if self._engine:
+            _add_engine(total, self._engine)
+        return total
+
+    def snapshot(self) -> SessionSnapshot:
+        """Copy the state; learning online is not part of it."""
+        engine = self._engine
+        return SessionSnapshot(
+            replace(self._state),
+            replace(self._stats),
+            engine.resolution if engine else None,
+            engine.snapshot() if engine else None,
+        )
+
+    def restore(self, snapshot: SessionSnapshot) -> None:
+        """Go on from a snapshot of a session with the same encoder; the policy may be another.
+
+        Raises:
+            InputError: it is of another encoder, or of no session at all. This one is no longer of use.
+        """
+        every_us, before = self._state.every_us, snapshot.state
+        self._state = replace(before, every_us=every_us)
+        if before.every_us != every_us:
+            self._state.next_us = None
+        has_classifier, self._engine = self._stats.correct is not None, None
+        self._stats = replace(
+            snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
+        )
+        if snapshot.resolution and snapshot.engine:
+            self._engine_for(snapshot.resolution).restore(snapshot.engine)
+
+    def process(self, item: StreamItem) -> Iterator[Emission]:
+        """Take in one item of the stream, and yield what is read on the way."""
+        if isinstance(item, Watermark):
+            self._source_ns = 0
+            yield from self._pass_time(item.t_us)
+            return
+        if isinstance(item, Label):
+            yield from self._finish_sample()
+            self._state.sample, self._state.seen_label = item, True
+            self._start_anew(item.start_us)
+            return
+        if self._state.epoch not in (None, item.epoch):
+            yield from self._finish_sample()
+            self._start_anew(0)
+            self._state.lost = True
+        self._state.epoch = item.epoch
+        self._state.lost |= item.lost > 0
+        self._log_time_ns, self._source_ns = item.log_time_ns, item.source_ns
+        events = item.events
+        if len(events) == 0:
+            return
+        engine = self._engine_for(item.resolution)
+        sound = _sound(events, item.resolution)
+        latest = self._stream_times(events, sound)
+        if self._state.lost:
+            # What is missing came before this packet, so it has left the window one window after it.
+            self._state.incomplete_us = max(self._state.incomplete_us, int(latest[0]) + self._window_us)
+            self._state.lost = False
+        end = len(events)
+        if self._state.sample:
+            stop = self._state.sample.start_us + self._state.sample.duration_us
+            end = int(np.searchsorted(latest, stop))
+            early = sound[:end] & (events["t"][:end] < self._state.sample.start_us)
+            if early.any():
+                self._stats.late += int(np.count_nonzero(early))
+                kept = np.concatenate([~early, np.ones(len(events) - end, np.bool_)])
+                events, latest, end = events[kept], latest[kept], int(np.count_nonzero(kept[:end]))
+        yield from self._feed(engine, events[:end], latest[:end])
+        if end < len(events):
+            yield from self._finish_sample()
+            yield from self._feed(engine, events[end:], latest[end:])
+
+    def rest(self) -> None:
+        """Nothing waits: bring the engine up to date for the next reading, for half of the time at most."""
+        now = self._clock()
+        if self._engine and self.policy.kind != "auto" and now >= self._ahead_from:
+            self._engine.prepare(_AHEAD_COLUMNS)
+            self._ahead_from = now + 2 * (self._clock() - now)
+
+    def finish(self) -> Iterator[Emission]:
+        """End the stream: the open sample is read, and what was collected is learned."""
+        self._source_ns = 0
+        yield from self._finish_sample()
+        if self._state.unread and self._engine:
+            yield self._read(self._engine, self._state.last_us + 1)
+        if self.learner:
+            self.learner.flush()
+
+    def _start_anew(self, origin_us: int) -> None:
+        """Begin with an empty window whose bins start at the origin."""
+        self._state.origin_us = origin_us
+        self._state.last_us = origin_us
+        self._state.next_us = None
+        self._state.unread = 0
+        self._state.silent_us = self._state.incomplete_us = BEFORE_TIME
+        if self._engine:
+            self._engine.restart(origin_us)
+
+    def _pass_time(self, t_us: int) -> Iterator[Emission]:
+        """Read what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
+        sample, engine = self._state.sample, self._engine
+        if sample and t_us >= sample.start_us + sample.duration_us:
+            yield from self._finish_sample()
+        if engine is None or (self._state.seen_label and not self._state.sample):
+            return
+        every = self._state.every_us
+        if self._state.next_us is None:
+            self._state.next_us = self._following(self._state.last_us, every)
+        while (due := self._due(t_us, every)) <= t_us:
+            yield self._read(engine, due)
+            self._state.next_us = due + every
+            self._state.silent_us = due
+
+    def _stream_times(self, events: Events, sound: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Stream time after each event: it never goes back, and events that will be rejected have no say."""
+        t = events["t"]
+        if not sound.all():
+            t = np.where(sound, t, BEFORE_TIME)
+        return np.maximum(np.maximum.accumulate(t), self._state.last_us)
+
+    def _engine_for(self, resolution: Resolution) -> Engine:
+        if self._engine and self._engine.resolution == resolution:
+            return self._engine
+        engine = self._make_engine(
+            self.encoder, resolution, origin_us=self._state.origin_us, look_ahead=self._every_event
+        )
+        if self._engine:
+            _add_engine(self._stats, self._engine)
+        self._engine = engine
+        return engine
+
+    def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        done = 0
+        if self._every_event:
+            done = yield from self._trace(engine, events, latest)
+        elif self.policy.kind == "time":
+            done = yield from self._feed_by_time(engine, events, latest)
+        elif self.policy.kind == "events":
+            done = yield from self._feed_by_count(engine, events, latest)
+        if done < len(events):
+            yield from self._feed_at_once(engine, events[done:], latest[done:])
+
+    def _trace(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """One emission an event, until all is done or others wait; tells how many were followed.
+
+        Some events at a time, because that many calls from Python would cost far more.
+        """
+        start, before = 0, self._stats.events
+        self._state.next_us = None
+        while start < len(events) and not self._is_behind(self._log_time_ns):
+            traced = slice(start, min(start + _TRACE, len(events)))
+            features, accepted = engine.trace(events[traced])
+            self._state.last_us = max(self._state.last_us, int(latest[traced][-1]))
+            times, scores = latest[traced].tolist(), self._scores(features)
+            for i, n_events in enumerate(accepted.tolist()):
+                yield self._emission(times[i] + 1, before + n_events, features[i], scores[i])
+            self._state.unread = 0
+            start = traced.stop
+        return start
+
+    def _scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
+        classifier = self.classifier
+        return classifier.scores(features) if classifier else np.zeros((len(features), 0), np.float32)
+
+    def _emission(
+        self,
+        t_us: int,
+        n_events: int,
+        features: NDArray[np.float32],
+        scores: NDArray[np.float32],
+        *,
+        final: bool = False,
+    ) -> Emission:
+        # After a silence that was read, stream time as told by events may lie behind it.
+        t_us = max(t_us, self._state.silent_us)
+        incomplete = t_us <= self._state.incomplete_us
+        self._stats.emissions += 1
+        self._stats.incomplete += incomplete
+        classifier = self.classifier
+        return Emission(
+            t_us=t_us,
+            n_events=n_events,
+            features=features,
+            labels=classifier.labels if classifier else (),
+            scores=scores,
+            sample=self._state.sample,
+            final=final,
+            topic=self._topic,
+            incomplete=incomplete,
+            source_ns=self._source_ns,
+        )
+
+    def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+        self._take(engine, events, latest)
+        self._state.next_us = None
+        now = self._clock()
+        if now >= self._rest_until:
+            yield self._read(engine, self._state.last_us + 1)
+            spent = self._clock() - now
+            self._rest_until = now + spent * (1 + _AUTO_REST)
+
+    def _feed_by_count(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """Feed and read until all is done, or others wait; tells how many were fed."""
+        start = 0
+        self._state.next_us = None
+        while start < len(events) and not self._is_behind(self._log_time_ns):
+            stop = min(start + max(self.policy.every - self._state.unread, 1), len(events))
+            self._take(engine, events[start:stop], latest[start:stop])
+            start = stop
+            if self._state.unread >= self.policy.every:
+                yield self._read(engine, self._state.last_us + 1)
+        return start
+
+    def _feed_by_time(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Generator[Emission, None, int]:
+        """Feed and read until all is done, or others wait; tells how many were fed."""
+        start = 0
+        while start < len(events) and not self._is_behind(self._log_time_ns):
+            due = self._due(int(latest[start]), self.policy.every)
+            stop = int(np.searchsorted(latest, due))
+            if stop > start:
+                self._take(engine, events[start:stop], latest[start:stop])
+                start = stop
+            else:
+                yield self._read(engine, due)
+                self._state.next_us = due + self.policy.every
+        return start
+
+    def _following(self, t_us: int, every: int) -> int:
+        return t_us - (t_us - self._state.origin_us) % every + every
+
+    def _due(self, t_us: int, every: int) -> int:
+        """When to read next, given stream time `t_us`; readings of an empty window are passed over."""
+        following = self._following(t_us, every)
+        if self._state.next_us is None:
+            self._state.next_us = following
+        # After this nothing changes until the next event. Between labelled samples nobody asks.
+        silent = self._state.last_us + (
+            0 if self._state.seen_label and not self._state.sample else self._window_us + every
+        )
+        if self._state.next_us > silent and not self._state.unread:
+            self._state.next_us = following
+        return self._state.next_us
+
+    def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
+        engine.feed(events)
+        self._state.unread += len(events)
+        self._state.last_us = max(self._state.last_us, int(latest[-1]))
+
+    def _read(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
+        engine.advance(t_us - 1)
+        features = engine.features()
+        self._state.unread = 0
+        scores = self._scores(features[np.newaxis])[0]
+        return self._emission(t_us, self._stats.events + engine.n_events, features, scores, final=final)
+
+    def _finish_sample(self) -> Iterator[Emission]:
+        sample = self._state.sample
+        if sample is None:
+            return
+        self._stats.samples += 1
+        geometry = self.encoder.geometry
+        engine = self._engine or self._engine_for((geometry.patch * geometry.downsample,) * 2)
+        emission = self._read(engine, sample.start_us + sample.duration_us, final=True)
+        if emission.correct and self._stats.correct is not None:
+            self._stats.correct += 1
+        if self.learner:
+            if sample.label in self.learner.classifier.labels:
+                self.learner.learn_one(emission.features, sample.label)
+            else:
+                self._stats.unknown_labels += 1
+        self._state.sample = None
+        self._state.next_us = None
+        yield emission
+
+
+def _sound(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
+    """Which events will not be rejected."""
+    height, width = resolution
+    x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
+    sound: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
+    return sound & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
+
+
+def _add_engine(stats: SessionStats, engine: Engine) -> None:
+    seen = engine.stats()
+    stats.events += seen.events
+    stats.late += seen.late
+    stats.rejected += seen.rejected
+    stats.saturated += seen.saturated

@@ -1,0 +1,246 @@
+"""Where emissions go: the terminal, JSON lines, MCAP.
+
+Lives here: `Sink` and its three kinds; each is written to by one task, off the event loop's thread.
+Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`).
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Protocol, TextIO, TypeVar
+
+from rich.console import Console
+from rich.text import Text
+
+from streamfeat.errors import InputError
+from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.emission import Emission
+
+__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record", "open_sinks"]
+
+_LINES_A_SECOND = 4.0
+
+T = TypeVar("T", contravariant=True)
+
+
+class Sink(Protocol[T]):
+    """Takes emissions, or whatever else a pipeline makes, in order. May block; is called from one thread at a
+    time.
+    """
+
+    def write(self, emissions: Sequence[T], /) -> None:
+        """Take some, at least one."""
+
+    def close(self, *, failed: bool) -> None:
+        """End: finish what was written, or (`failed`) leave nothing half done behind."""
+
+
+S = TypeVar("S", bound=Sink[Any])
+
+
+def open_sinks(*makers: Callable[[], S] | None) -> list[S]:
+    """Make the sinks that are wanted: all of them or, when one cannot be made, none is left open.
+
+    Args:
+        makers: without arguments; what is None is not wanted.
+    """
+    with ExitStack() as opening:
+        sinks: list[S] = []
+        for make in makers:
+            if make:
+                sinks.append(make())
+                opening.callback(sinks[-1].close, failed=True)
+        opening.pop_all()
+    return sinks
+
+
+def emission_record(emission: Emission, *, features: bool = False) -> dict[str, Any]:
+    """An emission as JSON values."""
+    record: dict[str, Any] = {"t_us": emission.t_us, "n_events": emission.n_events}
+    if emission.topic:
+        record["topic"] = emission.topic
+    if emission.incomplete:
+        record["incomplete"] = True
+    if emission.labels:
+        record["prediction"] = emission.prediction
+        record["scores"] = {
+            label: round(float(score), 6)
+            for label, score in zip(emission.labels, emission.scores, strict=True)
+        }
+    if emission.sample:
+        record["sample"] = {
+            "label": emission.sample.label,
+            "elapsed_us": emission.t_us - emission.sample.start_us,
+            "source": emission.sample.source,
+            "final": emission.final,
+        }
+    if features:
+        record["features"] = [float(value) for value in emission.features]
+    return record
+
+
+class JsonLinesSink:
+    """One JSON object a line; to a file, which appears when complete, or to an open stream."""
+
+    def __init__(self, target: Path | TextIO, *, features: bool = False) -> None:
+        """Open the target.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        self._path = target if isinstance(target, Path) else None
+        self._features = features
+        try:
+            self._part = self._path.with_name(self._path.name + ".part") if self._path else None
+            self._stream = self._part.open("w") if self._part else target
+        except OSError as error:
+            raise InputError(f"{target}: cannot write there: {error.strerror}") from error
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Write a line for each emission.
+
+        Raises:
+            InputError: the disk is full, or whatever else keeps the target from being written.
+        """
+        lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
+        with self._explaining():
+            self._stream.writelines(lines)  # type: ignore[union-attr]
+            if self._path is None:
+                self._stream.flush()  # type: ignore[union-attr]
+
+    def close(self, *, failed: bool) -> None:
+        """Put the file in its place, or remove it.
+
+        Raises:
+            InputError: as for `write`; the file is removed then.
+        """
+        if self._path is None or self._part is None:
+            return  # each write was flushed
+        try:
+            with suppress(OSError) if failed else self._explaining():
+                self._stream.close()  # type: ignore[union-attr]
+            if not failed:
+                self._part.replace(self._path)
+        finally:
+            self._part.unlink(missing_ok=True)
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            raise  # who reads has enough, as `head` has: no fault of anybody's
+        except OSError as error:
+            where = self._path or "standard output"
+            raise InputError(f"{where}: cannot be written: {error.strerror}; is there room?") from None
+
+
+class RecordingSink:
+    """Features, predictions and labels as MCAP messages.
+
+    Args:
+        writer: closed with the sink.
+        topic_of: the topic for `label`, `features` or `prediction` of the camera with a given topic.
+    """
+
+    def __init__(
+        self, writer: RecordingWriter, topic_of: Callable[[str, str], str] = lambda topic, kind: f"/{kind}"
+    ) -> None:
+        """Write nothing yet."""
+        self._writer = writer.__enter__()
+        self._topic_of = topic_of
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Write a features message for each emission, and a prediction where there is one."""
+        for e in emissions:
+            if e.final and e.sample:
+                self._writer.write_label(e.sample, self._topic_of(e.topic, "label"))
+            topic = self._topic_of(e.topic, "features")
+            self._writer.write_features(e.t_us, e.n_events, e.features, incomplete=e.incomplete, topic=topic)
+            if e.prediction is not None:
+                topic = self._topic_of(e.topic, "prediction")
+                self._writer.write_prediction(e.t_us, e.prediction, e.labels, e.scores, topic=topic)
+
+    def close(self, *, failed: bool) -> None:
+        """Finish the file, or leave none."""
+        error = InputError("abandoned") if failed else None
+        self._writer.__exit__(type(error) if error else None, error, None)
+
+
+class TerminalSink:
+    """A line for each labelled sample, or for each second without labels; never a flood.
+
+    Args:
+        console: where to print.
+        clock: seconds, monotonic.
+        every_sample: show each labelled sample, however fast they come.
+    """
+
+    def __init__(
+        self, console: Console, clock: Callable[[], float] = time.monotonic, *, every_sample: bool = False
+    ) -> None:
+        """Start with nothing seen."""
+        self._console = console
+        self._every_sample = every_sample
+        self._clock = clock
+        self._next = 0.0
+        self._samples = 0
+        self._correct = 0
+        self._skipped = 0
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Count every emission, and show one where it is time to."""
+        finals = [e for e in emissions if e.final]
+        if self._every_sample:
+            for e in finals:
+                self._samples, self._correct = self._samples + 1, self._correct + bool(e.correct)
+                self._console.print(self._line(e), highlight=False)
+            finals, emissions = [], [e for e in emissions if not e.final]
+            if not emissions:
+                return
+        self._samples += len(finals)
+        self._correct += sum(bool(e.correct) for e in finals)
+        self._skipped += len(finals)
+        shown = finals[-1] if finals else None
+        if shown is None:
+            if any(e.sample for e in emissions):
+                return
+            shown = emissions[-1]
+        if self._clock() < self._next:
+            return
+        self._skipped -= shown.final
+        self._next = self._clock() + (1 / _LINES_A_SECOND if shown.final else 1.0)
+        self._console.print(self._line(shown), highlight=False)
+
+    def close(self, *, failed: bool) -> None:
+        """Say how many samples were not shown."""
+        if self._skipped:
+            self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
+
+    def _line(self, e: Emission) -> Text:
+        line = Text()
+        line.append(f"{e.t_us / 1e6:8.2f} s ", style="dim")
+        if e.topic:
+            line.append(f"{e.topic}  ", style="cyan")
+        line.append(f"{e.n_events:>10,} events  ")
+        if e.prediction is not None:
+            first, second = sorted(e.scores, reverse=True)[:2]
+            line.append(f"{e.prediction:<{max(map(len, e.labels))}}", style="bold")
+            line.append(f" {first - second:+6.2f}  ", style="dim")
+        if e.sample and e.final:
+            if e.correct is None:
+                line.append(f"is {e.sample.label}")
+            elif e.correct:
+                line.append("right", style="green")
+            else:
+                line.append(f"is {e.sample.label}", style="red")
+            if e.labels:
+                line.append(f"  {100 * self._correct / self._samples:.1f} % of {self._samples}", style="dim")
+        elif e.prediction is None:
+            line.append("sum of features ", style="dim")
+            line.append(f"{float(abs(e.features).sum()):9.1f}")
+        if e.incomplete:
+            line.append("  incomplete", style="yellow")
+        return line

@@ -1,0 +1,144 @@
+"""Emissions as a table, for pandas, polars, DuckDB and whatever else reads Arrow.
+
+Lives here: the columns, and a sink that writes them as an Arrow or Parquet file.
+Not here: other sinks (`sinks`), and features of samples in memory (`features`).
+"""
+
+import importlib
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from streamfeat.errors import InputError
+from streamfeat.stream.emission import Emission
+
+__all__ = ["TableSink"]
+
+_GROUP_BYTES = 16 << 20
+"""Rows are written in groups of about so many bytes of features: what waits in memory is bounded, and a group
+is worth compressing."""
+
+
+class TableSink:
+    """A row for each emission: Parquet (`.parquet`), or an Arrow file (`.arrow`, `.feather`).
+
+    Columns: `t_us`, `n_events`, `topic`, `incomplete`, `prediction` (null without a classifier), `scores` (in
+    the order of the labels that the table's metadata have under `labels`), `label`, `split`, `source` and
+    `elapsed_us` of the labelled sample (null outside of one), `final` (the reading at the end of a sample,
+    the one that counts), and `features`, a list of fixed size. The file appears when it is complete.
+
+    Args:
+        path: of the file; replaced if it exists.
+        n_features: length of a feature vector.
+        labels: names that the scores belong to.
+
+    Raises:
+        InputError: the ending is another, pyarrow is not there, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path, n_features: int, labels: Sequence[str] = ()) -> None:
+        """Open the file."""
+        self._path, self._part = path, path.with_name(path.name + ".part")
+        self._n_features = n_features
+        self._waiting: list[Emission] = []
+        self._pa = _library("pyarrow", path)
+        self._schema = self._make_schema(labels)
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot write there: {error.strerror}") from error
+        if path.suffix.lower() == ".parquet":
+            self._writer = _library("pyarrow.parquet", path).ParquetWriter(self._file, self._schema)
+        else:
+            self._writer = self._pa.ipc.new_file(self._file, self._schema)
+
+    def write(self, emissions: Sequence[Emission]) -> None:
+        """Keep the emissions until there are enough for a group of rows.
+
+        Raises:
+            InputError: the disk is full, or whatever else keeps the file from being written.
+        """
+        self._waiting += emissions
+        if len(self._waiting) * self._n_features * 4 >= _GROUP_BYTES:
+            with self._explaining():
+                self._write_group()
+
+    def close(self, *, failed: bool) -> None:
+        """Put the file in its place, or remove it.
+
+        Raises:
+            InputError: as for `write`; the file is removed then.
+        """
+        try:
+            with suppress(OSError) if failed else self._explaining():
+                if not failed and self._waiting:
+                    self._write_group()
+                self._writer.close()
+                self._file.close()
+            if not failed:
+                self._part.replace(self._path)
+        finally:
+            with suppress(OSError):  # once more, where the first could not write what was left
+                self._file.close()
+            self._part.unlink(missing_ok=True)
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{self._path}: cannot be written: {reason}; is there room?") from None
+
+    def _make_schema(self, labels: Sequence[str]) -> Any:
+        pa = self._pa
+        columns = {
+            "t_us": pa.int64(),
+            "n_events": pa.int64(),
+            "topic": pa.string(),
+            "incomplete": pa.bool_(),
+            "prediction": pa.string(),
+            "scores": pa.list_(pa.float32()),
+            "label": pa.string(),
+            "split": pa.string(),
+            "source": pa.string(),
+            "elapsed_us": pa.int64(),
+            "final": pa.bool_(),
+            "features": pa.list_(pa.float32(), self._n_features),
+        }
+        return pa.schema(list(columns.items()), metadata={"labels": json.dumps(list(labels))})
+
+    def _write_group(self) -> None:
+        pa, rows = self._pa, self._waiting
+        self._waiting = []
+        samples = [e.sample for e in rows]
+        values: dict[str, list[Any]] = {
+            "t_us": [e.t_us for e in rows],
+            "n_events": [e.n_events for e in rows],
+            "topic": [e.topic for e in rows],
+            "incomplete": [e.incomplete for e in rows],
+            "prediction": [e.prediction for e in rows],
+            "scores": [e.scores for e in rows],
+            "label": [s and s.label for s in samples],
+            "split": [s and s.split for s in samples],
+            "source": [s and s.source for s in samples],
+            "elapsed_us": [e.t_us - e.sample.start_us if e.sample else None for e in rows],
+            "final": [e.final for e in rows],
+        }
+        arrays = [pa.array(column, self._schema.field(name).type) for name, column in values.items()]
+        flat = pa.array(np.concatenate([e.features for e in rows]))
+        arrays.append(pa.FixedSizeListArray.from_arrays(flat, self._n_features))
+        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
+
+
+def _library(name: str, path: Path) -> Any:
+    if path.suffix.lower() not in (".parquet", ".arrow", ".feather"):
+        raise InputError(f"{path}: tables end in .parquet, .arrow or .feather")
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(f"{path}: writing it needs pyarrow: pip install 'streamfeat[export]'") from error
