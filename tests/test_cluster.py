@@ -22,13 +22,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_net import free_port, until
 
+from streamfeat.camera_files import datasets
 from streamfeat.classify.features import encode_recordings
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
 from streamfeat.evaluate.run import evaluate
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.foreign import datasets
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import open_recording

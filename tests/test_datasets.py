@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from test_event_files import bin40_bytes, dat_bytes, text_bytes
 
+from streamfeat.camera_files.event_files import read_events
+from streamfeat.convert.datasets import SamplePath, convert, find_samples
 from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
-from streamfeat.foreign.datasets import SamplePath, convert, find_samples
-from streamfeat.foreign.event_files import read_events
 from streamfeat.recordings.reader import Label, Sample, open_recording
 
 NCARS_HEADER = b"% Data file containing N9Chronocam7Event2dE events.\n% Version 2\n\x00\x08"
@@ -201,7 +201,7 @@ class TestConvert:
 
     def test_a_file_too_large_to_hold_is_read_twice_with_the_same_result(self, ncars, tmp_path, monkeypatch):
         convert(ncars, tmp_path / "held.mcap")
-        monkeypatch.setattr("streamfeat.foreign.datasets._HELD_IN_MEMORY", 0)
+        monkeypatch.setattr("streamfeat.convert.datasets._HELD_IN_MEMORY", 0)
         convert(ncars, tmp_path / "twice.mcap")
         assert (tmp_path / "twice.mcap").read_bytes() == (tmp_path / "held.mcap").read_bytes()
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from streamfeat.camera_files.event_files import FORMATS, open_events, read_events
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
-from streamfeat.foreign.event_files import FORMATS, open_events, read_events
 
 EVENTS = make_events([3, 0, 120, 33], [5, 99, 7, 0], [1, 0, 0, 1], [0, 10, 10, 90_000])
 DAT_HEADER = b"% Data file containing Event2d events.\n% Version 2\n% Width 304\n% Height 240\n\x00\x08"

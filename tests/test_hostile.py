@@ -23,11 +23,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from safetensors.numpy import save
 
+from streamfeat.camera_files.event_files import read_events
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE
-from streamfeat.foreign.event_files import read_events
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS
 from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter, recover

@@ -23,10 +23,10 @@ from streams import (
     streams,
 )
 
+from streamfeat.camera_files.event_files import open_events
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
-from streamfeat.foreign.event_files import open_events
 from streamfeat.kernels.layout import CLOCK_PLANE, CLOCK_TOUCHED
 from streamfeat.recordings.reader import open_recording
 

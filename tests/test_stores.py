@@ -10,6 +10,7 @@ import tiny
 from test_datasets import bin40_bytes, put, sample_events
 from test_places import SOURCE, items
 
+from streamfeat.convert.datasets import convert
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
@@ -17,7 +18,6 @@ from streamfeat.evaluate.run import evaluate
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files import locations as places
 from streamfeat.files.locations import StoreLocation, size_of
-from streamfeat.foreign.datasets import convert
 from streamfeat.recordings.reader import open_recording
 
 s3fs = pytest.importorskip("s3fs", reason="stores need the extra `store`")

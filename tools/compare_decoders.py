@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from streamfeat.camera_files.event_files import read_events
 from streamfeat.events import Events, make_events
-from streamfeat.foreign.event_files import read_events
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import streamfeat as sf
 from streamfeat.classify.classifier import train_classifier
 from streamfeat.classify.features import encode_samples
-from streamfeat.foreign.datasets import convert
+from streamfeat.convert.datasets import convert
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.settings import Setting
 

@@ -19,13 +19,13 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from streamfeat.camera_files.event_files import open_events
 from streamfeat.classify.classifier import Classifier
+from streamfeat.convert.datasets import convert
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.events import Events
-from streamfeat.foreign.datasets import convert
-from streamfeat.foreign.event_files import open_events
 from streamfeat.messages.cdr import EventArray, LabelMessage
 from streamfeat.recordings.reader import Label, Packet, open_recording
 from streamfeat.recordings.writer import RecordingWriter, recover

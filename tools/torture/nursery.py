@@ -22,7 +22,7 @@ _MOTHER = """
 import json, os, sys, traceback
 import numba, numpy, scipy.optimize, sklearn.linear_model, sklearn.model_selection, zenoh
 import streamfeat.cli, streamfeat.classify.classifier, streamfeat.classify.features
-import streamfeat.foreign.datasets
+import streamfeat.convert.datasets
 import streamfeat.evaluate.run, streamfeat.evaluate.tables, streamfeat.learn.fit, streamfeat.live.listen
 import streamfeat.live.record, tools.torture.state
 

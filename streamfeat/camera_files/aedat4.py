@@ -1,7 +1,7 @@
 """AEDAT 4, the files of iniVation's DV: a header, then packets of several streams, one of them events.
 
 Lives here: the header, the description of the streams, packets and their compression.
-Not here: which format a file has (`streamfeat.foreign.event_files`).
+Not here: which format a file has (`streamfeat.camera_files.event_files`).
 
 The layout is that of docs.inivation.com, "AEDAT 4.0": a FlatBuffers table with the compression, where the
 index is, and an XML description of the streams; then packets, each with its stream, its length, and a
@@ -23,9 +23,9 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from streamfeat.camera_files.prophesee import Source, checked_resolution
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
-from streamfeat.foreign.prophesee import Source, checked_resolution
 
 __all__ = ["aedat4_resolution", "read_aedat4"]
 

@@ -1,7 +1,7 @@
 """Tables of events: text, NumPy arrays, and the checks that any columns need.
 
 Lives here: finding the columns x, y, p, t and their units, and refusing values that are no events.
-Not here: which file is a table (`streamfeat.foreign.event_files`).
+Not here: which file is a table (`streamfeat.camera_files.event_files`).
 """
 
 import re
@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.camera_files.prophesee import BLOCK_BYTES, Source, checked_resolution
 from streamfeat.errors import InputError
 from streamfeat.events import FIELD_NAMES, Events, Resolution, make_events
-from streamfeat.foreign.prophesee import BLOCK_BYTES, Source, checked_resolution
 
 __all__ = [
     "HEAD_BYTES",

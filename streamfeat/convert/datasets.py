@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 
+from streamfeat.camera_files.event_files import EXTENSIONS, open_events
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.locations import Location, StoreLocation, fetched, files_below, is_folder, location_of
-from streamfeat.foreign.event_files import EXTENSIONS, open_events
 from streamfeat.recordings.reader import Label
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.work.workers import THIS_PROCESS, Workers

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.camera_files.hdf5_process import FRAME
+from streamfeat.camera_files.prophesee import Source, declared_resolution
+from streamfeat.camera_files.tables import checked_events, named_columns, one_line
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.foreign.hdf5_process import FRAME
-from streamfeat.foreign.prophesee import Source, declared_resolution
-from streamfeat.foreign.tables import checked_events, named_columns, one_line
 
 __all__ = ["hdf5_resolution", "read_hdf5"]
 
@@ -65,7 +65,7 @@ def _frames(path: Path) -> Iterator[tuple[bytes, bytes]]:
         _DamageError: the library gave up, or did not come to an end.
     """
     # -P: the folder that somebody works in is no place to import from.
-    command = [sys.executable, "-P", "-m", "streamfeat.foreign.hdf5_process", str(path.resolve())]
+    command = [sys.executable, "-P", "-m", "streamfeat.camera_files.hdf5_process", str(path.resolve())]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
         assert process.stdout

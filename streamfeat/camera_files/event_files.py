@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.errors import InputError, printable
-from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.foreign.aedat4 import aedat4_resolution, read_aedat4
-from streamfeat.foreign.containers import hdf5_resolution, read_hdf5
-from streamfeat.foreign.prophesee import (
+from streamfeat.camera_files.aedat4 import aedat4_resolution, read_aedat4
+from streamfeat.camera_files.containers import hdf5_resolution, read_hdf5
+from streamfeat.camera_files.prophesee import (
     declared_resolution,
     percent_header,
     read_bin40,
@@ -24,7 +22,9 @@ from streamfeat.foreign.prophesee import (
     read_evt3,
     start_of_dat,
 )
-from streamfeat.foreign.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
+from streamfeat.camera_files.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
+from streamfeat.errors import InputError, printable
+from streamfeat.events import EVENT_DTYPE, Events, Resolution
 
 __all__ = ["EXTENSIONS", "FORMATS", "EventFile", "ForeignFile", "open_events", "read_events"]
 

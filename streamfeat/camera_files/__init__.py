@@ -1,0 +1,6 @@
+"""Camera files: events that other tools have written, one file of any known format at a time.
+
+Lives here: recognising a format (`event_files`), and the formats: sensor words (`prophesee`), packets
+(`aedat4`), containers that a library opens (`containers`), text and NumPy (`tables`).
+Not here: MCAP and bags (`recordings`), folders of labelled samples (`convert`).
+"""
