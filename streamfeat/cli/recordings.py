@@ -97,7 +97,7 @@ def convert(
 
     Files that cannot be read are reported, and the others converted; the exit status is 1 then.
     """
-    from streamfeat.camera_files import datasets
+    from streamfeat.convert import datasets
 
     if not 0 < gap_ms < 1e9:
         raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
