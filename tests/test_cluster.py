@@ -22,8 +22,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_net import free_port, until
 
-from streamfeat.camera_files import datasets
 from streamfeat.classify.features import encode_recordings
+from streamfeat.convert import datasets
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.plan import plan_cells
