@@ -64,7 +64,7 @@ def mark_noise(
     """
     height, width = level.shape
     for i in range(len(events)):
-        x, y, t = np.int64(events[i]["x"]), np.int64(events[i]["y"]), events[i]["t"]
+        x, y, t = int(events[i]["x"]), int(events[i]["y"]), int(events[i]["t"])
         keep[i] = True
         if x >= width or y >= height or events[i]["p"] >> 1 != 0 or not BEFORE_TIME < t < -BEFORE_TIME:
             continue
