@@ -1,39 +1,31 @@
-"""Reading recordings: batches, packets, labels and labelled samples out of an MCAP file.
+"""Reading recordings: batches, packets, labels and labelled samples.
 
 Lives here: `open_recording` and what it gives; choosing the topic, decoding, counting.
-Not here: the file format and its damage (`records`), messages (`streamfeat.messages`), writing (`writer`).
+Not here: formats (`sources`), messages (`streamfeat.messages`), writing (`writer`).
 
 A recording is read in file order with one packet in memory at a time. What cannot be read is skipped and
 counted in `Recording.losses`; only a recording that yields nothing at all is an error.
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from os import PathLike
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
-from mcap.records import Channel, Schema
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.files.locations import Location, StoreLocation, absolute, location_of
+from streamfeat.files.locations import Location, StoreLocation, absolute
 from streamfeat.messages.cdr import LabelMessage
-from streamfeat.messages.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
-from streamfeat.recordings.records import (
-    Losses,
-    Summary,
-    count_missing,
-    iter_messages,
-    iter_records,
-    open_mcap,
-    read_summary,
-)
+from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.recordings.opening import open_source
+from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
+from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -49,38 +41,13 @@ __all__ = [
 ]
 
 _LOOP_GAP_US = 1_000_000
+_TOPICS_SHOWN = 20
 
 _PART_BYTES = 1 << 20
 _MOST_PARTS = 1000
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One topic of a recording."""
-
-    name: str
-    schema: str
-    schema_encoding: str
-    n_messages: int
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Some chunks of a recording, from byte `start` to byte `end`.
-
-    Where there are labels it begins with the first in those chunks and reaches to the first behind them, so
-    that the parts of a recording hold each label and its events once, whichever chunk these are in.
-    """
-
-    start: int
-    end: float
-
-
-WHOLE = Part(0, math.inf)
-"""All of a recording."""
 
 
 @dataclass(slots=True)
@@ -137,23 +104,16 @@ class Recording:
         self, path: str | PathLike[str] | StoreLocation, topic: str | None = None, part: Part = WHOLE
     ) -> None:
         """See `open_recording`."""
-        self.path = location_of(path)
+        self._source = open_source(path)
         self._part = part
-        self._file = open_mcap(self.path)
         try:
-            summary = read_summary(self._file)
-            # Counts from a summary tell what should be there; a scan can only tell what is.
-            self._has_summary = summary is not None
-            self._known = summary or _scan(self._file)
-            self.topics = _topics(self._known)
-            self.topic = _choose_topic(
-                self.path, [t for t in self.topics if t.schema in EVENT_SCHEMAS], topic
-            )
+            self.path, self.topics = self._source.path, self._source.topics
+            self.topic = _choose_topic(self.path, self.topics, topic)
             self.encoding = ""
             self.resolution = self._first_packet().resolution
             self.losses = Losses()
         except BaseException:
-            self._file.close()
+            self._source.close()
             raise
 
     def __enter__(self) -> Self:
@@ -167,8 +127,8 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the file; iterating after that is an error."""
-        self._file.close()
+        """Close what it is read from; iterating after that is an error."""
+        self._source.close()
 
     def __iter__(self) -> Iterator[Events]:
         """Yield batches of events in stored order: `(n,)` arrays of `EVENT_DTYPE`, n > 0."""
@@ -179,7 +139,7 @@ class Recording:
     @property
     def is_labelled(self) -> bool:
         """Whether there may be labels."""
-        return any(topic.schema == LabelMessage.SCHEMA_NAME for topic in self.topics)
+        return any(topic.holds == "labels" for topic in self.topics)
 
     def parts(self) -> list[Part]:
         """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
@@ -187,7 +147,7 @@ class Recording:
         They depend on the file alone. There is but one where the file does not tell where its chunks are, or
         where packets cannot be read without those before them (evt3).
         """
-        starts = sorted(self._known.chunk_starts) if self.encoding != "evt3" else []
+        starts = self._source.cuts() if self.encoding != "evt3" else []
         cuts = [0]
         for start in starts:
             if start >= cuts[-1] + max(_PART_BYTES, starts[-1] // _MOST_PARTS):
@@ -218,34 +178,26 @@ class Recording:
         """
         losses = self.losses = Losses()
         reader = PacketReader(self.topic)
-        seen: Counter[int] = Counter()
-        for at, channel, schema, message in iter_messages(
-            self._file, self._known, losses, part.start, part.end
-        ):
+        for at, stored in self._source.read(self.topic, part, losses):
+            if not isinstance(stored, StoredMessage):
+                yield at, stored
+                continue
             if at >= part.end:
                 losses = Losses()
-            is_label = schema.name == LabelMessage.SCHEMA_NAME
-            if not is_label and (channel.topic != self.topic or schema.name not in EVENT_SCHEMAS):
-                continue
-            seen[channel.id] += 1
+            is_label = stored.schema == LabelMessage.SCHEMA_NAME
             item: Packet | Label
             try:
                 if is_label:
-                    item = Label.from_cdr(message.data)
+                    item = Label.from_cdr(stored.data)
                 else:
-                    item = reader.read(schema.name, message.data, message.log_time, message.sequence)
+                    item = reader.read(stored.schema, stored.data, stored.log_time_ns, stored.sequence)
                     self._check_size(item)
                     self.encoding = self.encoding or reader.encoding
             except InputError as error:
-                where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
-                losses.add("bad label" if is_label else "bad packet", len(message.data), where)
+                where = f"topic {stored.topic!r}, message {stored.number} (byte {at}): {error}"
+                losses.add("bad label" if is_label else "bad packet", len(stored.data), where)
             else:
                 yield at, item
-        promised = self._known.channels if self._has_summary and part == WHOLE else {}
-        for channel_id, channel in promised.items():
-            kind = self._known.schemas.get(channel.schema_id)
-            if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
-                count_missing(self._known, channel_id, seen[channel_id], losses)
 
     def played(
         self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
@@ -257,9 +209,11 @@ class Recording:
             report: told, with each item of the first time, how many there have been and how many there are;
                 0 if that is unknown.
         """
-        wanted = {*EVENT_SCHEMAS, LabelMessage.SCHEMA_NAME}
-        topics = [t for t in self.topics if t.schema in wanted]
-        total = sum(t.n_messages for t in topics if t.name == self.topic or t.schema not in EVENT_SCHEMAS)
+        total = sum(
+            t.n_messages
+            for t in self.topics
+            if t.holds == "labels" or (t.holds == "events" and t.name == self.topic)
+        )
         for done, item in enumerate(self.items(), 1):
             yield item
             report(done, 0 if loop else total)
@@ -343,36 +297,18 @@ class Recording:
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
 
 
-def _scan(file: BinaryIO) -> Summary:
-    """Build what a summary would say, from the records that are there."""
-    found, counts = Summary(), Counter[int]()
-    for _, record in iter_records(file, Losses()):
-        if isinstance(record, Channel):
-            found.channels[record.id] = record
-        elif isinstance(record, Schema):
-            found.schemas[record.id] = record
-        else:
-            counts[record.channel_id] += 1
-    found.message_counts = dict(counts)
-    return found
-
-
-def _topics(known: Summary) -> list[Topic]:
-    """List the topics; several channels of one topic and schema are one."""
-    counts: dict[tuple[str, str, str], int] = {}
-    for channel in known.channels.values():
-        schema = known.schemas.get(channel.schema_id)
-        key = (channel.topic, schema.name if schema else "", schema.encoding if schema else "")
-        counts[key] = counts.get(key, 0) + known.message_counts.get(channel.id, 0)
-    return [Topic(*key, n_messages=n) for key, n in counts.items()]
-
-
 def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
-    names = sorted({t.name for t in topics if t.schema in EVENT_SCHEMAS})
+    names = sorted({topic.name for topic in topics if topic.holds == "events"})
     if not names:
-        raise InputError(f"{path}: no topic carries {' or '.join(EVENT_SCHEMAS)}; is this the right file?")
+        others = ", ".join(f"{topic.name} ({topic.schema or 'no type'})" for topic in topics[:_TOPICS_SHOWN])
+        more = f" and {len(topics) - _TOPICS_SHOWN} more" if len(topics) > _TOPICS_SHOWN else ""
+        raise InputError(
+            f"{path}: no topic carries events; " + (f"there are {others}{more}" if topics else "it has none")
+        )
     if wanted is None and len(names) > 1:
-        raise InputError(f"{path}: several topics carry events, choose one of {names}")
+        raise InputError(
+            f"{path}: {len(names)} topics carry events: {', '.join(names)}; choose one with --topic"
+        )
     if wanted is not None and wanted not in names:
-        raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
+        raise InputError(f"{path}: no events on topic {wanted}; --topic can be {', '.join(names)}")
     return wanted or names[0]
