@@ -139,7 +139,9 @@ class Evt3Output(_OneSensor):
     def begin(self, resolution: Resolution) -> None:
         """See `_OneSensor.begin`."""
         height, width = resolution
-        header = f"% evt 3.0\n% format EVT3;height={height};width={width}\n% geometry {width}x{height}\n% end\n"
+        header = (
+            f"% evt 3.0\n% format EVT3;height={height};width={width}\n% geometry {width}x{height}\n% end\n"
+        )
         self._file.write(header.encode())
 
     def add(self, events: Events) -> None:
@@ -180,7 +182,7 @@ class NpzOutput(_OneSensor):
         super().__init__(path)
         self._file = file
         self._n = 0
-        self._columns = {name: tempfile.TemporaryFile(dir=path.parent) for name in "xypt"}
+        self._columns = {name: tempfile.TemporaryFile(dir=path.parent) for name in "xypt"}  # noqa: SIM115
 
     def add(self, events: Events) -> None:
         """See `_OneSensor.add`."""
@@ -195,12 +197,12 @@ class NpzOutput(_OneSensor):
                 header = {"descr": EVENT_DTYPE[name].str, "fortran_order": False, "shape": (self._n,)}
                 column.seek(0)
                 with members.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array_header_1_0(member, header)  # type: ignore[arg-type]
+                    np.lib.format.write_array_header_1_0(member, header)
                     while block := column.read(1 << 20):
                         member.write(block)
                 column.close()
             with members.open("resolution.npy", "w") as member:
-                np.lib.format.write_array(member, np.array(self.resolution or (0, 0)))  # type: ignore[arg-type]
+                np.lib.format.write_array(member, np.array(self.resolution or (0, 0)))
 
 
 class Hdf5Output(_OneSensor):

@@ -106,7 +106,7 @@ class Selection:
         x, y, width, height = self.crop
         if x + width > resolution[1] or y + height > resolution[0]:
             raise InputError(
-                f"--crop {x},{y},{width},{height} reaches beyond the sensor of {resolution[1]}x{resolution[0]}"
+                f"--crop {x},{y},{width},{height} reaches beyond a sensor of {resolution[1]}x{resolution[0]}"
             )
         inside = (events["x"] >= x) & (events["x"] < x + width)
         inside &= (events["y"] >= y) & (events["y"] < y + height)

@@ -8,22 +8,26 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from os import PathLike
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
+from streamfeat.denoise.stage import Denoiser
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.files.locations import Location, StoreLocation, absolute
+from streamfeat.files.locations import Location, absolute, location_of
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
-from streamfeat.recordings.opening import open_source
-from streamfeat.recordings.records import Losses
+from streamfeat.recordings.bags import assumptions_of
+from streamfeat.recordings.labels import read_labels, with_labels
+from streamfeat.recordings.opening import RecordingPath, open_source
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
+from streamfeat.recordings.records import Losses, unpacked_message
 from streamfeat.recordings.samples import Sample, complete_samples
 from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic
 
@@ -71,26 +75,31 @@ class _Totals:
         self.last_us = last if self.last_us is None else max(last, self.last_us)
 
 
-def open_recording(path: str | PathLike[str] | StoreLocation, topic: str | None = None) -> "Recording":
-    """Open an MCAP recording of events.
+def open_recording(
+    path: RecordingPath, topic: str | None = None, options: ReadOptions = AS_IT_IS
+) -> "Recording":
+    """Open a recording of events: MCAP, a bag of ROS 1 or 2, a camera file, or several of one kind.
 
     Args:
-        path: the file; text that is a URL means a file in a store, see `streamfeat.files.locations`.
+        path: a file; a rosbag2 folder; a pattern or a list, whose files are one recording. Text that is a
+            URL means a file in a store, see `streamfeat.files.locations`.
         topic: the event topic to read; may be left out when there is only one.
+        options: what the recording does not say, labels for it, noise to be taken out.
 
     Raises:
-        InputError: the file is missing, empty or no MCAP; it has no event topic, several and none was
-            chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
+        InputError: the file is missing, empty or of no known format; it has no event topic, several and none
+            was chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
             it, too, where a store refuses or goes away.
     """
-    return Recording(path, topic)
+    return Recording(path, topic, options=options)
 
 
 class Recording:
     """A recording of events, read in file order; iterate as often as you like.
 
     `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass
-    (an iteration, or the first use of a count) could not read.
+    (an iteration, or the first use of a count) could not read, `removed` what of it was taken out as noise.
+    `assumptions` are lines that say what the files leave open and how it was decided.
     """
 
     path: Location
@@ -99,13 +108,23 @@ class Recording:
     resolution: Resolution
     encoding: str
     losses: Losses
+    assumptions: list[str]
 
     def __init__(
-        self, path: str | PathLike[str] | StoreLocation, topic: str | None = None, part: Part = WHOLE
+        self,
+        path: RecordingPath,
+        topic: str | None = None,
+        part: Part = WHOLE,
+        options: ReadOptions = AS_IT_IS,
     ) -> None:
         """See `open_recording`."""
-        self._source = open_source(path)
-        self._part = part
+        labels = read_labels(Path(options.labels)) if options.labels is not None else None
+        self._source = open_source(path, topic, options)
+        self._given, self._part, self._options, self._labels = path, part, options, labels
+        self._denoiser = Denoiser(options.denoising)
+        self.assumptions = assumptions_of(self._source)
+        if labels and labels.assumption:
+            self.assumptions.append(labels.assumption)
         try:
             self.path, self.topics = self._source.path, self._source.topics
             self.topic = _choose_topic(self.path, self.topics, topic)
@@ -139,15 +158,23 @@ class Recording:
     @property
     def is_labelled(self) -> bool:
         """Whether there may be labels."""
-        return any(topic.holds == "labels" for topic in self.topics)
+        return self._labels is not None or any(topic.holds == "labels" for topic in self.topics)
+
+    @property
+    def removed(self) -> dict[str, int]:
+        """Events that the latest pass took out as noise, by reason."""
+        return self._denoiser.removed
 
     def parts(self) -> list[Part]:
         """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
 
-        They depend on the file alone. There is but one where the file does not tell where its chunks are, or
-        where packets cannot be read without those before them (evt3).
+        They depend on the file alone. There is but one where the file does not tell where its chunks are,
+        where packets cannot be read without those before them (evt3), where labels are put into the stream,
+        and where noise is taken out of a stream without labels, at which that would start anew.
         """
-        starts = self._source.cuts() if self.encoding != "evt3" else []
+        is_whole = self.encoding == "evt3" or self._labels is not None
+        is_whole |= bool(self._options.denoising) and not self.is_labelled
+        starts = self._source.cuts() if not is_whole else []
         cuts = [0]
         for start in starts:
             if start >= cuts[-1] + max(_PART_BYTES, starts[-1] // _MOST_PARTS):
@@ -156,7 +183,7 @@ class Recording:
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
         """What opens some of this recording, wherever that is called, and can be pickled."""
-        return partial(Recording, absolute(self.path), self.topic, part)
+        return partial(Recording, _wherever(self._given), self.topic, part, self._options)
 
     def items(self) -> Iterator[Packet | Label]:
         """Yield packets and labels in stored order; a label comes before its first packet."""
@@ -176,6 +203,16 @@ class Recording:
         Args:
             part: where to begin; what is lost behind it is not counted.
         """
+        placed = self._stored_items(part)
+        if self._labels:
+            placed = with_labels(placed, self._labels)
+        if self._options.denoising:
+            self._denoiser = Denoiser(self._options.denoising)
+            placed = self._denoiser.stream(placed)
+        return placed
+
+    def _stored_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
+        """As `placed_items`, of what is in the files."""
         losses = self.losses = Losses()
         reader = PacketReader(self.topic)
         for at, stored in self._source.read(self.topic, part, losses):
@@ -187,10 +224,11 @@ class Recording:
             is_label = stored.schema == LabelMessage.SCHEMA_NAME
             item: Packet | Label
             try:
+                data = unpacked_message(stored.data)
                 if is_label:
-                    item = Label.from_cdr(stored.data)
+                    item = Label.from_cdr(data)
                 else:
-                    item = reader.read(stored.schema, stored.data, stored.log_time_ns, stored.sequence)
+                    item = reader.read(stored.schema, data, stored.log_time_ns, stored.sequence)
                     self._check_size(item)
                     self.encoding = self.encoding or reader.encoding
             except InputError as error:
@@ -290,11 +328,18 @@ class Recording:
             raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
 
     def _first_packet(self) -> Packet:
-        for _, item in self.placed_items(WHOLE):
+        for _, item in self._stored_items(WHOLE):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
+
+
+def _wherever(path: RecordingPath) -> RecordingPath:
+    """The same files, whatever folder somebody works in."""
+    if isinstance(path, str) or not isinstance(path, Sequence):
+        return absolute(location_of(path))
+    return [absolute(location_of(one)) for one in path]
 
 
 def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
