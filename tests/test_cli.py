@@ -364,7 +364,7 @@ REFUSALS = {
     "folder": (["info", "{bad}/folder"], "folder"),
     "empty": (["info", "{bad}/empty"], "is empty"),
     "truncated": (["info", "{bad}/cut"], "cut: "),
-    "no mcap": (["info", "{bad}/text"], "is not an MCAP recording"),
+    "no mcap": (["info", "{bad}/text"], "not a known event file"),
     "no event topic": (["info", "{bad}/no_events"], "no topic carries"),
     "two event topics": (["info", "{bad}/two_topics"], "/left, /right; choose one with --topic"),
     "wrong topic": (["info", "{bad}/two_topics", "--topic", "/up"], "no events on topic /up;"),

@@ -32,11 +32,13 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
+from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["learn", "train"]
 
@@ -45,9 +47,11 @@ _KEEP_REST = 19
 
 
 @app.command(epilog="Example: streamfeat learn recordings/digits_train.mcap -o model.safetensors")
+@reads_recordings()
 def learn(
     context: typer.Context,
     recordings: RecordingsArgument,
+    reading: "ReadOptions",
     model: Annotated[Path, typer.Option("--output", "-o", help="Model to write.")],
     formulation: Annotated[str | None, typer.Option(help="direct or inverse.", show_default="direct")] = None,
     preset: options.Preset = "default",
@@ -95,7 +99,9 @@ def learn(
     part = model.with_name(model.name + ".part")
     try:
         with contextlib.ExitStack() as files:
-            opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
+            opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
+            for rec in opened:
+                print_assumptions(rec.assumptions)
             place = files.enter_context(working(cluster, workers, quiet=quiet))
             report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
             encoder = learn_encoder(
@@ -127,6 +133,7 @@ def learn(
         )
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
+        print_removed(rec.losses)
         print_losses(rec.losses)
     if encoder.provenance["interrupted"]:
         err.print(
@@ -154,8 +161,10 @@ def _keeper(path: Path) -> "Keep":
 @app.command(
     epilog="Example: streamfeat train recordings/digits_train.mcap -m model.safetensors -o clf.safetensors"
 )
+@reads_recordings()
 def train(
     recordings: RecordingsArgument,
+    reading: "ReadOptions",
     model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
@@ -177,10 +186,14 @@ def train(
     refuse_existing(classifier, overwrite=overwrite)
     encoder = Encoder.load(model)
     with contextlib.ExitStack() as files:
-        opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
+        opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:
+            print_assumptions(rec.assumptions)
             if not rec.is_labelled:
-                raise InputError(f"{rec.path}: has no labelled samples; `streamfeat convert` writes labels")
+                raise InputError(
+                    f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
+                    "or write them with `streamfeat convert`"
+                )
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)
@@ -207,4 +220,5 @@ def train(
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
     print_result(result, "trained", as_json=as_json)
     for rec in opened:
+        print_removed(rec.losses)
         print_losses(rec.losses)

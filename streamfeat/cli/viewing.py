@@ -5,7 +5,7 @@ Not here: the view (`streamfeat.view`).
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -23,8 +23,12 @@ from streamfeat.cli.program import (
     progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, StoreLocation, location_of
+
+if TYPE_CHECKING:
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["view"]
 
@@ -33,8 +37,10 @@ __all__ = ["view"]
     epilog="Example: streamfeat view recordings/digits_test.mcap -m recordings/digits.safetensors "
     "-c recordings/digits_classifier.safetensors --web"
 )
+@reads_recordings()
 def view(
     model: ModelOption,
+    reading: "ReadOptions",
     source: Annotated[
         str | None,
         typer.Argument(metavar="REC|KEYEXPR", help="MCAP recording or its URL, or live topics."),
@@ -81,6 +87,7 @@ def view(
     from streamfeat.report.pages import require
 
     require("foxglove", extra="view", what="a view")
+    from streamfeat.recordings.options import AS_IT_IS
     from streamfeat.view.job import View
 
     for path in (output, layout):
@@ -96,10 +103,17 @@ def view(
     if recording:
         if ros2 is not None:
             raise InputError("give a recording, or a ROS 2 topic with --ros2, not both")
-        options = {"speed": speed or ("1" if served else "max"), "topic": topic, "split": split}
+        options = {
+            "speed": speed or ("1" if served else "max"),
+            "topic": topic,
+            "split": split,
+            "reading": reading,
+        }
     else:
-        if loop or speed or split or topic:
-            raise InputError("--loop, --speed, --split and --topic are for recordings")
+        if loop or speed or split or topic or reading != AS_IT_IS:
+            raise InputError(
+                "--loop, --speed, --split, --topic and what tells how to read are for recordings"
+            )
         options = {"zenoh_config": zenoh_config, "port": zenoh_port, "console": err}
     job = View(
         recording or names_of(source, ros2, domain),
@@ -113,6 +127,8 @@ def view(
         say=lambda line: None if quiet else err.print(escape(line), soft_wrap=True),
         **options,
     )
+    if recording:
+        print_assumptions(job.assumptions)
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     with progress_bars(quiet=quiet) as report:
@@ -121,8 +137,9 @@ def view(
 
 
 def _recording(source: str | None) -> Location | None:
-    """The recording that is meant, if it is one: a URL, a file that exists, or what is called as one."""
+    """The recording that is meant, if it is one: a URL, what exists, or what is called as one."""
     if source is None:
         return None
     place = location_of(source)
-    return place if isinstance(place, StoreLocation) or place.suffix == ".mcap" or place.is_file() else None
+    is_there = isinstance(place, StoreLocation) or place.exists()
+    return place if is_there or place.suffix in (".mcap", ".bag", ".db3") else None

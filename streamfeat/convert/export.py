@@ -6,64 +6,104 @@ Not here: reading (`streamfeat.recordings`), the kinds of files (`outputs`), dat
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
-from streamfeat.convert.outputs import Output
+from streamfeat.convert.outputs import open_output
 from streamfeat.convert.selection import Selection
 from streamfeat.errors import InputError
+from streamfeat.files.locations import Location, StoreLocation
 from streamfeat.messages.packets import Label
-from streamfeat.recordings.reader import Recording
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
+from streamfeat.recordings.reader import open_recording
+from streamfeat.recordings.records import Losses
 
-__all__ = ["Exported", "export"]
+__all__ = ["Exported", "convert_recording"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Exported:
-    """What was written.
+    """What was written, and what was not.
 
     Attributes:
         events: in the file.
         labels: in the file.
         labels_left_out: for they reach beyond the selection, or the kind of file holds no labels.
-        shift_us: subtracted from every time, where the kind of file cannot hold them as they are.
+        subtracted_us: from every time, where the kind of file cannot hold them as they are.
+        removed: events taken out as noise, by reason.
+        losses: what of the source could not be read.
+        assumptions: what the source leaves open, a line for each.
+        bytes_out: of the file.
     """
 
-    events: int
-    labels: int
-    labels_left_out: int
-    shift_us: int
+    events: int = 0
+    labels: int = 0
+    labels_left_out: int = 0
+    subtracted_us: int = 0
+    removed: dict[str, int] = field(default_factory=dict)
+    losses: Losses = field(default_factory=Losses)
+    assumptions: list[str] = field(default_factory=list)
+    bytes_out: int = 0
+
+    def result(self) -> dict[str, Any]:
+        """The counts, as JSON values; but for the first two only those that are not 0."""
+        names = ("labels", "labels_left_out", "subtracted_us")
+        more = {name: value for name in names if (value := getattr(self, name))}
+        return {"events": self.events, "bytes_out": self.bytes_out} | more | self.removed
 
 
-def export(
-    recording: Recording,
-    out: Output,
-    selection: Selection,
+def convert_recording(
+    source: Location,
+    target: Location,
+    topic: str | None = None,
+    reading: ReadOptions = AS_IT_IS,
+    selection: Selection | None = None,
     *,
-    path: Path,
+    overwrite: bool = False,
+    encoding: str = "mono",
+    compression: Literal["zstd", "lz4", "none"] = "zstd",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Exported:
-    """Write a recording, or some of it.
+    """Write a recording, or some of it, in the format that the ending of `target` says.
 
     Args:
-        recording: an open one.
-        out: from `open_output`.
-        selection: what of it.
-        path: of the output, named in errors.
+        source: any recording, see `open_recording`.
+        target: a local file: .mcap, .raw, .h5, .npz or .csv. It appears only when all is written.
+        topic: of the events.
+        reading: how to read it.
+        selection: what of it; all if not given.
+        overwrite: replace `target` where it exists.
+        encoding: of the packets in MCAP, see `streamfeat.messages.codecs.PAYLOAD_ENCODINGS`.
+        compression: of the chunks in MCAP.
         progress: called with items read and how many there are, 0 if that is unknown.
 
     Raises:
-        InputError: nothing is left to write, or the kind of file cannot hold it.
+        InputError: the source cannot be read, nothing of it is left to write, or the kind of file cannot hold
+            it.
     """
-    n_events = n_labels = left_out = 0
-    for item in selection.items(recording.played(loop=False, report=progress)):
-        if isinstance(item, Label):
-            n_labels += out.holds_labels
-            left_out += not out.holds_labels
-            out.label(item)
-        else:
-            n_events += len(item.events)
-            out.write(item.events, item.resolution)
-    if n_events == 0:
-        raise InputError(f"{path}: not written: no event of {recording.path} is left")
-    return Exported(n_events, n_labels, left_out + selection.labels_left_out, out.shift_us)
+    if isinstance(target, StoreLocation):
+        raise InputError(f"{target}: output is local; give a file, and copy it to the store")
+    selection, done = selection or Selection(), Exported()
+    formats: dict[str, Any] = {"overwrite": overwrite, "encoding": encoding, "compression": compression}
+    with open_recording(source, topic, reading) as recording:
+        with open_output(Path(target), **formats) as out:
+            for item in selection.items(recording.played(loop=False, report=progress)):
+                try:
+                    if isinstance(item, Label):
+                        out.label(item)
+                        done.labels += out.holds_labels
+                        done.labels_left_out += not out.holds_labels
+                    else:
+                        out.write(item.events, item.resolution)
+                        done.events += len(item.events)
+                except InputError as error:
+                    known = str(error).startswith(str(target))
+                    raise error if known else InputError(f"{source}: {error}") from None
+            if done.events == 0:
+                raise InputError(f"{source}: holds no events, or none is left; {target} was not written")
+        done.labels_left_out += selection.labels_left_out
+        done.subtracted_us, done.removed = out.shift_us, recording.removed
+        done.losses, done.assumptions = recording.losses, recording.assumptions
+    done.bytes_out = target.stat().st_size
+    return done

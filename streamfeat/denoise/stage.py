@@ -9,7 +9,6 @@ comes through as if it stood alone; replay, training and offline features see th
 """
 
 import re
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Self, TypeVar
 
@@ -152,8 +151,3 @@ class Denoiser:
             if len(item.events):
                 return replace(item, events=self.events(item.events, item.resolution))
         return item
-
-    def stream(self, placed: Iterable[tuple[int, Item]]) -> Iterator[tuple[int, Item]]:
-        """Items of a recording, each with its byte, without their noise."""
-        for at, item in placed:
-            yield at, self.process(item)

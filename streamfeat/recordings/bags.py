@@ -18,7 +18,7 @@ from streamfeat.files.locations import Location, StoreLocation, files_below, ope
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.sources import WHOLE, Part, Source, SourceItem, StoredMessage, Topic
 
-__all__ = ["BAG_ENDINGS", "FilesSource", "Metadata", "bag_members", "read_metadata"]
+__all__ = ["BAG_ENDINGS", "FilesSource", "Metadata", "bag_members", "is_bag", "read_metadata"]
 
 BAG_ENDINGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """Files of a rosbag2 folder."""
@@ -57,6 +57,11 @@ def read_metadata(text: str) -> Metadata:
         if name and count:
             counts[name[1].strip("'\"")] = int(count[1])
     return Metadata(tuple(dict.fromkeys(names)), counts)
+
+
+def is_bag(folder: Location) -> bool:
+    """Whether a folder holds a bag: its `metadata.yaml`, or a file that one can have."""
+    return any(f.name == _METADATA or f.name.endswith(BAG_ENDINGS) for f in _files_in(folder))
 
 
 def bag_members(folder: Location) -> tuple[list[Location], Metadata, list[str]]:

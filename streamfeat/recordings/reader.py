@@ -8,6 +8,7 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -27,9 +28,9 @@ from streamfeat.recordings.bags import assumptions_of
 from streamfeat.recordings.labels import read_labels, with_labels
 from streamfeat.recordings.opening import RecordingPath, open_source
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
-from streamfeat.recordings.records import Losses, unpacked_message
+from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
-from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic
+from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic, unpacked_message
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -121,7 +122,6 @@ class Recording:
         labels = read_labels(Path(options.labels)) if options.labels is not None else None
         self._source = open_source(path, topic, options)
         self._given, self._part, self._options, self._labels = path, part, options, labels
-        self._denoiser = Denoiser(options.denoising)
         self.assumptions = assumptions_of(self._source)
         if labels and labels.assumption:
             self.assumptions.append(labels.assumption)
@@ -163,7 +163,7 @@ class Recording:
     @property
     def removed(self) -> dict[str, int]:
         """Events that the latest pass took out as noise, by reason."""
-        return self._denoiser.removed
+        return {name: self.losses.removed[name] for name in self._options.denoising.names}
 
     def parts(self) -> list[Part]:
         """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
@@ -207,9 +207,27 @@ class Recording:
         if self._labels:
             placed = with_labels(placed, self._labels)
         if self._options.denoising:
-            self._denoiser = Denoiser(self._options.denoising)
-            placed = self._denoiser.stream(placed)
+            placed = self._without_noise(placed, part)
         return placed
+
+    def _without_noise(
+        self, placed: Iterator[tuple[int, Packet | Label]], part: Part
+    ) -> Iterator[tuple[int, Packet | Label]]:
+        """Items of a part without their noise; what is taken out is counted in one part only."""
+        denoiser = Denoiser(self._options.denoising)
+        before: dict[str, int] = {}
+        is_counted, is_labelled = part.start == 0 or not self.is_labelled, self.is_labelled
+        for at, item in placed:
+            if is_labelled and isinstance(item, Label):
+                if not is_counted and at < part.end:
+                    before, is_counted = denoiser.removed, True
+                elif at >= part.end:
+                    is_counted = False
+            kept = denoiser.process(item)
+            if is_counted:
+                self.losses.removed = Counter(denoiser.removed)
+                self.losses.removed.subtract(before)
+            yield at, kept
 
     def _stored_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
         """As `placed_items`, of what is in the files."""

@@ -39,13 +39,11 @@ __all__ = [
     "iter_records",
     "open_mcap",
     "read_summary",
-    "unpacked_message",
 ]
 
 _MAGIC = b"\x89MCAP0\r\n"
 _VERSION_AT = 5
 MAX_RECORD_BYTES = 1 << 28
-_ZSTD = b"\x28\xb5\x2f\xfd"
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 _SCAN_BYTES = 1 << 16
@@ -71,6 +69,8 @@ class Losses:
     bytes: Counter[str] = field(default_factory=Counter)
     first: dict[str, str] = field(default_factory=dict)
     """For each reason, where it struck first and why."""
+    removed: Counter[str] = field(default_factory=Counter)
+    """Events that were taken out as noise, on request, by reason: no losses."""
 
     def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
         """Count one loss."""
@@ -84,6 +84,7 @@ class Losses:
         self.counts += others.counts
         self.bytes += others.bytes
         self.first = others.first | self.first
+        self.removed.update(others.removed)
 
     def __bool__(self) -> bool:
         """Whether anything was lost."""
@@ -317,23 +318,6 @@ def _decompress(chunk: Chunk) -> bytes:
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError("the CRC of the chunk does not match")
     return bytes(data)
-
-
-def unpacked_message(data: bytes | memoryview) -> bytes | memoryview:
-    """A message that was compressed by itself (rosbag2's `compression_mode: message`), or as it is.
-
-    Raises:
-        InputError: it cannot be unpacked, or has more than `MAX_RECORD_BYTES`.
-    """
-    if data[:4] != _ZSTD:  # no CDR message begins so: its first byte is 0
-        return data
-    try:
-        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES + 1)
-    except zstandard.ZstdError as error:
-        raise InputError(f"the compressed message cannot be unpacked: {error}") from None
-    if len(unpacked) > MAX_RECORD_BYTES:
-        raise InputError(f"the compressed message has more than {MAX_RECORD_BYTES} bytes")
-    return bytes(unpacked)
 
 
 def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:

@@ -9,12 +9,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
+import zstandard
+
+from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import EVENT_SCHEMAS, Label, Packet
-from streamfeat.recordings.records import Losses
+from streamfeat.recordings.records import MAX_RECORD_BYTES, Losses
 
-__all__ = ["WHOLE", "Part", "Source", "SourceItem", "StoredMessage", "Topic"]
+__all__ = ["WHOLE", "Part", "Source", "SourceItem", "StoredMessage", "Topic", "unpacked_message"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +57,8 @@ class Part:
     start: int
     end: float
 
+
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 WHOLE = Part(0, math.inf)
 """All of a recording."""
@@ -113,3 +118,20 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Close all files; reading after that is an error."""
+
+
+def unpacked_message(data: bytes | memoryview) -> bytes | memoryview:
+    """A message that was compressed by itself (rosbag2's `compression_mode: message`), or as it is.
+
+    Raises:
+        InputError: it cannot be unpacked, or has more than `MAX_RECORD_BYTES`.
+    """
+    if data[:4] != _ZSTD:  # no CDR message begins so: its first byte is 0
+        return data
+    try:
+        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise InputError(f"the compressed message cannot be unpacked: {error}") from None
+    if len(unpacked) > MAX_RECORD_BYTES:
+        raise InputError(f"the compressed message has more than {MAX_RECORD_BYTES} bytes")
+    return bytes(unpacked)

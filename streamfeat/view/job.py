@@ -123,6 +123,11 @@ class View:
                 with self._heeding_signals():
                     self._wait_for(self._stopped, "that was all; Ctrl-C ends")
 
+    @property
+    def assumptions(self) -> list[str]:
+        """What a recording leaves open and how that was decided; nothing of live topics."""
+        return self._job.assumptions if isinstance(self._job, ReplayJob) else []
+
     def write_layout(self, path: Path, topic: str) -> None:
         """Write a Foxglove layout that shows all channels of a camera.
 
