@@ -66,6 +66,7 @@ def write_split(folder, n=2, **options):
     names = "\n".join(f"  - bag_{i}.mcap" for i in range(n))
     head, _, rest = metadata.partition("  relative_file_paths:")
     rest = rest[rest.index("  ros_distro") :]
+    head = head[: head.index("  files:")] + "  message_count: 20\n"
     text = f"{head}  relative_file_paths:\n{names}\n{rest}".replace(f"count: {20 // n}", "count: 20")
     (folder / "metadata.yaml").write_text(text)
     return folder

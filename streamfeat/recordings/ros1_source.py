@@ -49,10 +49,13 @@ class Ros1Source:
         for connection in self._bag.connections:
             key = (connection.topic, connection.msgtype)
             counts[key] = counts.get(key, 0) + connection.msgcount
-        self._types = get_typestore(Stores.EMPTY)
+        self._types = get_typestore(Stores.ROS2_HUMBLE)
         for kind, connection in {c.msgtype: c for c in self._bag.connections}.items():
             try:
-                self._types.register(get_types_from_msg(connection.msgdef.data, kind))
+                found = get_types_from_msg(connection.msgdef.data, kind)
+                # Types that ROS 2 has as well stay its own: a header of ROS 1 has a number more.
+                new = {name: type_ for name, type_ in found.items() if name not in self._types.types}
+                self._types.register(new)
             except Exception:  # a type that the library cannot parse has no messages for us
                 continue
         self.topics = [Topic(*key, "ros1msg", n_messages=n) for key, n in counts.items()]
