@@ -123,9 +123,7 @@ def _read_aedat3(path: Path, start: int, losses: Losses) -> Iterator[Events]:
                 or overflow < 0
                 or (kind == 1 and size != 8)
             ):
-                losses.lose(
-                    0, f"byte {at}: a packet of {number} events of {size} bytes; what follows is lost"
-                )
+                losses.lose(0, f"byte {at}: {number} events of {size} bytes in a packet; the rest is lost")
                 return
             data = raw.read(n_bytes)
             if len(data) < n_bytes:

@@ -77,7 +77,8 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
         size = sum(member.file_size for member in archive.infolist())
         if size > LARGEST_UNPACKED:
             raise InputError(
-                f"{path}: not a readable NumPy file: {size} bytes when unpacked, more than {LARGEST_UNPACKED}; "
+                f"{path}: not a readable NumPy file: {size} bytes when unpacked, more than "
+                f"{LARGEST_UNPACKED}; "
                 "save its arrays as .npy, or in several files"
             )
     with np.load(path, allow_pickle=False) as loaded:
@@ -99,7 +100,7 @@ def _tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, _Table], dict
     tables: dict[str, _Table] = {}
     others: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
-        kinds = array.dtype.names
+        kinds, is_plain = array.dtype.names, array.ndim == 2 and array.dtype.kind in "biuf"
         if kinds is not None and array.ndim == 1 and len(named_fields(kinds)[0]) == 4:
             tables[name] = [array[kind] for kind in kinds], [*kinds]
         elif (
@@ -110,7 +111,7 @@ def _tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, _Table], dict
             and array.dtype.kind in "biuf"
         ):
             tables[name] = [*array.T], None
-        elif kinds is None and array.ndim == 2 and array.shape[0] == 4 and array.dtype.kind in "biuf":
+        elif is_plain and array.shape[0] == 4:
             tables[name] = [*array], None
         else:
             others[name] = array

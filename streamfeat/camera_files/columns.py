@@ -47,6 +47,9 @@ _UNIT_NAMES = {
 }
 _ORDERS = ("txyp", "xytp", "xypt", "tpxy", "pxyt", "ptxy")
 _IN_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_NAME = re.compile(
+    r"(?:event_|events?/)?([a-z]+?)(?:[ _]*[\[(]\s*([a-z\u00b5\u03bc]+)\s*[\])]|[ _]+([a-z\u00b5\u03bc]+))?"
+)
 _LEAST_RATE = 100  # events a second; of noise alone, a sensor of 128x128 pixels gives ten times as many
 _LEAST_ROWS = 50  # to know a rate
 _LARGEST = {"x": 0xFFFF, "y": 0x7FFF, "p": 1, "t": (1 << 31) * 1_000_000 - 1}
@@ -68,9 +71,7 @@ def field_of(name: str) -> tuple[str, str]:
     an underscore.
     """
     text = name.strip().strip("\"'").strip().lower().partition("@")[0]
-    match = re.fullmatch(
-        r"(?:event_|events?/)?([a-z]+?)(?:[ _]*[\[(]\s*([a-zµμ]+)\s*[\])]|[ _]+([a-zµμ]+))?", text
-    )
+    match = _NAME.fullmatch(text)
     if match is None:
         return "", ""
     stem, unit = match[1], _UNIT_NAMES.get(match[2] or match[3] or "", "")
@@ -198,7 +199,7 @@ def _check_falls(path: Path, table: Sequence[NDArray[Any]], order: Sequence[int]
     names = ",".join([*["index"] * first, *(fits or "")])
     remedy = f"--columns {names} would fit" if fits else "sort its rows by time, or name them by --columns"
     raise InputError(
-        f"{path}: times fall in {falls} of {len(t) - 1} steps when column {order[0] + 1} is the time; {remedy}"
+        f"{path}: times fall in {falls} of {len(t) - 1} steps when column {order[0] + 1} is time; {remedy}"
     )
 
 
@@ -218,9 +219,8 @@ def _unit_of(t: NDArray[Any]) -> tuple[str, str]:
     span = top - float(t.min(initial=top))
     if len(t) < _LEAST_ROWS or span <= 0:
         return units[0][0], form
-    for unit, ticks in units:
-        if len(t) / span * ticks >= _LEAST_RATE:
-            break
+    rates = [(unit, len(t) / span * ticks) for unit, ticks in units]
+    unit = next((unit for unit, rate in rates if rate >= _LEAST_RATE), units[-1][0])
     if unit == units[0][0]:
         return unit, form
     slow = len(t) / span * units[0][1]
@@ -275,8 +275,8 @@ class Rows:
                 setattr(self, name, self.n + int(np.argmax(hit)))
         if self._minus >= 0 and self._zero >= 0:
             raise InputError(
-                f"{self._path}: polarity is -1 at event {self._minus} and 0 at event {self._zero}: one of them "
-                "is OFF, but which? Write 0 and 1, or -1 and 1"
+                f"{self._path}: polarity is -1 at event {self._minus} and 0 at event {self._zero}: one of "
+                "them is OFF, but which? Write 0 and 1, or -1 and 1"
             )
 
 

@@ -28,7 +28,15 @@ from streamfeat.camera_files.vectors import open_evt4, open_evt21
 from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 
-__all__ = ["EXTENSIONS", "FORMATS", "EventFile", "ForeignFile", "open_events", "read_events"]
+__all__ = [
+    "AS_THE_FILE_SAYS",
+    "EXTENSIONS",
+    "FORMATS",
+    "EventFile",
+    "ForeignFile",
+    "open_events",
+    "read_events",
+]
 
 FORMATS = {
     "dat": "Prophesee .dat (CD events, version 2)",
@@ -50,6 +58,9 @@ EXTENSIONS = frozenset(
     [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
 )
 """Endings, lower case, of files in which events are looked for."""
+
+AS_THE_FILE_SAYS = TableOptions()
+"""No options."""
 
 _Open = Callable[[Path, bytes, TableOptions], Contents]
 
@@ -162,7 +173,7 @@ class ForeignFile:
 
 
 def open_events(
-    path: str | Path, format: str | None = None, *, options: TableOptions = TableOptions()
+    path: str | Path, format: str | None = None, *, options: TableOptions = AS_THE_FILE_SAYS
 ) -> EventFile:
     """Open a camera file; its events are read when it is iterated.
 
@@ -191,7 +202,7 @@ def open_events(
 
 
 def read_events(
-    path: str | Path, format: str | None = None, *, options: TableOptions = TableOptions()
+    path: str | Path, format: str | None = None, *, options: TableOptions = AS_THE_FILE_SAYS
 ) -> ForeignFile:
     """Read all events of one camera file into memory; for large files iterate `open_events`.
 

@@ -59,9 +59,7 @@ def serve(path: Path, stream: str, out: BinaryIO) -> None:
             for dataset in datasets:
                 _check(h5py, root, dataset)
             if len({len(dataset) for dataset in datasets}) > 1:
-                raise InputError(
-                    f"{name}: its tables have different lengths; the file is cut short or damaged"
-                )
+                raise InputError(f"{name}: its tables differ in length; the file is cut short or damaged")
             _say(out, b"i", json.dumps(_about(h5py, root, name, tables, names, assumptions)).encode())
             size = sum(dataset.dtype.itemsize * math.prod(dataset.shape[1:]) for dataset in datasets)
             step = max(1, _BLOCK_BYTES // max(size, 1))
@@ -157,7 +155,7 @@ def _about(
     h5py: Any, root: Any, name: str, tables: _Tables, names: list[str] | None, assumptions: list[str]
 ) -> dict[str, Any]:
     """What the file says of the stream, for `containers`."""
-    group = root if name not in root else root[name]
+    group = root.get(name, root)
     group = group if isinstance(group, h5py.Group) else group.parent
     sizes: list[int] = []
     for holder in (group, root):
