@@ -117,7 +117,7 @@ def _read_aedat3(path: Path, start: int, losses: Losses) -> Iterator[Events]:
             kind, _, size, _, overflow, _, number, _ = _PACKET.unpack(head)
             n_bytes = size * number
             if (
-                size < 8
+                size < 1
                 or number < 0
                 or n_bytes > _LARGEST_PACKET
                 or overflow < 0
