@@ -196,8 +196,7 @@ def _check(h5py: Any, root: Any, dataset: Any) -> None:
     for code, name in ((f[0], f[3]) for f in map(filters.get_filter, range(filters.get_nfilters()))):
         if not h5py.h5z.filter_avail(code):
             remedy = (
-                "for ECF build github.com/prophesee-ai/hdf5_ecf and set HDF5_PLUGIN_PATH: no package on PyPI "
-                "has it"
+                "for ECF build github.com/prophesee-ai/hdf5_ecf and set HDF5_PLUGIN_PATH; hdf5plugin lacks it"
                 if code == 36559
                 else "pip install 'streamfeat[convert]' has Blosc, LZ4, Zstandard and others"
             )
