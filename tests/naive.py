@@ -43,7 +43,7 @@ def decode_evt3(words, state, out):
             ahead = time_high - time_high % 4096 + value
             if ahead < time_high:
                 ahead += 4096
-            is_late_word = ahead - 4096 >= 0 and time_high - (ahead - 4096) <= 10 and ahead != time_high
+            is_late_word = ahead - 4096 >= 0 and time_high - (ahead - 4096) < 2048 and ahead != time_high
             time_high = ahead - 4096 if is_late_word else ahead
             seen = max(seen, 1)
         elif seen >= 1 and kind == 0x6:

@@ -302,7 +302,7 @@ def _measure(path: Path, data_set: _DataSet | None) -> tuple[_Measured, str]:
             first_us, last_us = min(first_us, int(batch["t"].min())), max(last_us, int(batch["t"].max()))
     if n == 0:
         raise InputError(f"{path}: holds no events")
-    resolution = resolution or file.resolution or (height, width)
+    resolution = resolution or file.declared or (height, width)
     if height > resolution[0] or width > resolution[1]:
         raise InputError(
             f"{path}: events cover {width}x{height} pixels, its data set {resolution[1]}x{resolution[0]}"

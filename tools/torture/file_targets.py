@@ -194,9 +194,9 @@ def _read_foreign(name: str, data: bytes) -> bytes:
     seen = b""
     for batch in file:
         seen += check_events(batch)
-        if file.resolution and len(batch):
-            assert batch["y"].max() < file.resolution[0]
-            assert batch["x"].max() < file.resolution[1]
+        if file.declared and len(batch):
+            assert batch["y"].max() < file.declared[0]
+            assert batch["x"].max() < file.declared[1]
     for line in file.damage:
         check_line(line)
     if zlib.crc32(data) % _CONVERTED == 0:
