@@ -10,8 +10,9 @@ from contextlib import ExitStack
 import numpy as np
 
 from streamfeat.camera_files.event_files import EventFile, open_events
+from streamfeat.camera_files.source import TableOptions
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution
+from streamfeat.events import Events
 from streamfeat.files.locations import Location, fetched
 from streamfeat.messages.packets import MAX_PIXELS, Packet
 from streamfeat.recordings.options import ReadOptions
@@ -45,13 +46,14 @@ class CameraSource:
         """Open it, and find out what is there."""
         self.path = path
         stream = None if topic == _TOPIC else topic
+        tables = TableOptions(options.columns, options.time_unit, options.resolution, stream)
         with ExitStack() as copies:
             local = copies.enter_context(fetched(path))
             self._local, self._copies = local, ExitStack()
             try:
-                self._file: EventFile = open_events(local)
-                self.assumptions: list[str] = []
-                self.resolution = options.resolution or self._file.resolution or self._extent()
+                self._file: EventFile = open_events(local, options=tables)
+                self.resolution = self._file.resolution
+                self.assumptions = [self._named(f"{local}: {line}") for line in self._file.assumptions]
             except InputError as error:
                 raise InputError(self._named(str(error))) from None
             self._copies = copies.pop_all()
@@ -59,14 +61,15 @@ class CameraSource:
         if height * width > MAX_PIXELS:
             self.close()
             raise InputError(f"{path}: a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
-        self._topic = stream or _TOPIC
+        streams = self._file.streams
+        self._topic = stream or (streams[0] if len(streams) == 1 else _TOPIC)
         self.topics = [Topic(self._topic, self._file.format, "", 0, is_events=True)]
 
     def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, Packet]]:
         """See `Source`; the byte of every packet is 0."""
         seq = 0
         try:
-            for block in self._file:
+            for block in self._file.blocks():
                 for events in _cut(block):
                     log_time_ns = int(events["t"][0]) * 1000
                     yield 0, Packet(self._topic, events, self.resolution, log_time_ns, seq)
@@ -85,21 +88,6 @@ class CameraSource:
     def close(self) -> None:
         """See `Source`."""
         self._copies.close()
-
-    def _extent(self) -> Resolution:
-        """The smallest `(height, width)` that holds all events; reads the file once."""
-        height = width = 1
-        for events in self._file:
-            if len(events):
-                height, width = (
-                    max(height, int(events["y"].max()) + 1),
-                    max(width, int(events["x"].max()) + 1),
-                )
-        self.assumptions.append(
-            f"{self.path} does not say its resolution: {width}x{height} is the smallest that holds all "
-            "events; --resolution sets it"
-        )
-        return height, width
 
     def _named(self, text: str) -> str:
         """A message with the name of the file that its user knows."""
