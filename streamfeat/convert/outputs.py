@@ -114,6 +114,9 @@ class _OneSensor:
         self._release(_NEVER_US)
         self.end()
 
+    def close(self) -> None:
+        """Let go of what is open besides the file, however it ended."""
+
     def begin(self, resolution: Resolution) -> None:
         """Write what stands before the first events."""
 
@@ -190,6 +193,11 @@ class NpzOutput(_OneSensor):
         for name, column in self._columns.items():
             column.write(np.ascontiguousarray(events[name]).tobytes())
 
+    def close(self) -> None:
+        """See `_OneSensor.close`."""
+        for column in self._columns.values():
+            column.close()
+
     def end(self) -> None:
         """See `_OneSensor.end`."""
         with zipfile.ZipFile(self._file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as members:
@@ -200,7 +208,6 @@ class NpzOutput(_OneSensor):
                     np.lib.format.write_array_header_1_0(member, header)
                     while block := column.read(1 << 20):
                         member.write(block)
-                column.close()
             with members.open("resolution.npy", "w") as member:
                 np.lib.format.write_array(member, np.array(self.resolution or (0, 0)))
 
@@ -234,8 +241,8 @@ class Hdf5Output(_OneSensor):
         self._events.resize((n + len(events),))
         self._events[n:] = events
 
-    def end(self) -> None:
-        """See `_OneSensor.end`."""
+    def close(self) -> None:
+        """See `_OneSensor.close`; the table is whole then."""
         self._root.close()
 
 
@@ -304,7 +311,10 @@ def open_output(
     try:
         with replacing(path) as temporary, temporary.open("w+b") as file:
             output = _FOREIGN[kind](path, file)
-            yield output
-            output.finish()
+            try:
+                yield output
+                output.finish()
+            finally:
+                output.close()
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
