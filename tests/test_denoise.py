@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -10,6 +11,8 @@ from streamfeat.denoise.stage import Denoiser, Denoising, parse_duration
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.messages.packets import Label, Packet, Watermark
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 SIZE = (4, 5)
 
@@ -147,3 +150,30 @@ def test_what_is_no_duration_names_the_option(text):
 def test_rates_out_of_range(rate):
     with pytest.raises(InputError, match="events a second"):
         Denoising(hot_rate=rate)
+
+
+def test_a_session_counts_what_is_left(tmp_path):
+    denoising = Denoising(refractory_us=20_000)
+    items = [tiny.packet(part) for part in np.array_split(tiny.steady(0, 300_000, 3_000), 7)]
+    stage = Denoiser(denoising)
+    policy = EmitPolicy.parse("10ms")
+    plain, filtered = Session(tiny.encoder(), policy), Session(tiny.encoder(), policy, denoising=denoising)
+    for item in items:
+        expected = [*plain.process(stage.process(item))]
+        found = [*filtered.process(item)]
+        assert [e.t_us for e in found] == [e.t_us for e in expected]
+        for mine, theirs in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(mine.features, theirs.features)
+    assert filtered.stats() == plain.stats()
+    assert filtered.denoiser.removed == stage.removed
+    assert stage.removed["refractory"] > 100
+
+
+def test_replay_takes_out_what_the_stage_does_and_says_how_much(run, tmp_path):
+    events = tiny.steady(0, 300_000, 3_000)
+    path = tiny.write_items(tmp_path / "in.mcap", [tiny.packet(part) for part in np.array_split(events, 7)])
+    tiny.encoder().save(tmp_path / "m.safetensors")
+    result = run("replay", path, "-m", tmp_path / "m.safetensors", "--refractory", "20ms", "--json").json
+    stage = Denoiser(Denoising(refractory_us=20_000))
+    assert result["events"] == len(stage.events(events, tiny.RESOLUTION))
+    assert result["refractory"] == stage.removed["refractory"]

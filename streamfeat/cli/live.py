@@ -30,7 +30,14 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
-from streamfeat.cli.reading import print_assumptions, reads_recordings
+from streamfeat.cli.reading import (
+    HotPixels,
+    Isolated,
+    Refractory,
+    denoising_of,
+    print_assumptions,
+    reads_recordings,
+)
 from streamfeat.errors import InputError
 from streamfeat.files.locations import location_of
 
@@ -93,6 +100,9 @@ def listen(
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from labels published beside the events.")
     ] = False,
+    hot_pixels: HotPixels = None,
+    refractory: Refractory = None,
+    isolated: Isolated = None,
     ros2: RosOption = None,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
@@ -139,6 +149,7 @@ def listen(
     common: dict[str, Any] = {
         "emit": emit,
         "learn_online": learn_online,
+        "denoising": denoising_of(hot_pixels, refractory, isolated) or None,
         "reliable": reliable,
         "zenoh_config": zenoh_config,
         "port": port,

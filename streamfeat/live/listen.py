@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.live import Live
 
 from streamfeat.classify.classifier import Classifier
+from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
@@ -58,6 +59,7 @@ class ListenJob:
         classifier: to predict with; none for features alone.
         emit: when to read, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
+        denoising: noise of each camera that is taken out before anything is counted.
         reliable: recover missed packets and ask for history, from publishers that do the same.
         zenoh_config: JSON5 file; without it, this machine alone.
         port: where sessions on this machine meet.
@@ -86,6 +88,7 @@ class ListenJob:
         *,
         emit: str = "auto",
         learn_online: bool = False,
+        denoising: Denoising | None = None,
         reliable: bool = False,
         zenoh_config: Path | None = None,
         port: int = DEFAULT_PORT,
@@ -111,6 +114,9 @@ class ListenJob:
             raise InputError("--learn-online needs a classifier to start from; give one with -c")
         if state and learn_online:
             raise InputError("--state does not keep what --learn-online learns; give one of the two")
+        if state and denoising:
+            raise InputError("--state does not keep what is known of noisy pixels; give one of the two")
+        self._denoising = denoising
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._reliable = learn_online, reliable
@@ -248,6 +254,7 @@ class ListenJob:
             topic=topic,
             is_behind=is_behind or self._is_behind,
             engine=engine or self._engine_of(topic),
+            denoising=self._denoising,
         )
 
     def _keeper(self) -> Checkpointer:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution
@@ -49,6 +50,7 @@ class Session:
         topic: named in emissions.
         is_behind: tells from `log_time_ns` of the packet in hand whether it has waited too long.
         engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
+        denoising: noise that is taken out before anything is counted; no part of a snapshot.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -65,6 +67,7 @@ class Session:
         topic: str = "",
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
+        denoising: Denoising | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -79,6 +82,7 @@ class Session:
         self._is_behind = is_behind
         self._make_engine = engine
         self._every_event = policy == EmitPolicy("events", 1)
+        self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
         self._state = SessionState(every_us=every_us)
@@ -128,6 +132,8 @@ class Session:
 
     def process(self, item: StreamItem) -> Iterator[Emission]:
         """Take in one item of the stream, and yield what is read on the way."""
+        if self.denoiser:
+            item = self.denoiser.process(item)
         if isinstance(item, Watermark):
             self._source_ns = 0
             yield from self._pass_time(item.t_us)
