@@ -8,6 +8,7 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -21,11 +22,12 @@ from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.locations import Location, StoreLocation, absolute
 from streamfeat.messages.cdr import LabelMessage
-from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.messages.packets import Label, Packet
+from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.opening import open_source
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
-from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic
+from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -110,6 +112,7 @@ class Recording:
             self.path, self.topics = self._source.path, self._source.topics
             self.topic = _choose_topic(self.path, self.topics, topic)
             self.encoding = ""
+            self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution
             self.losses = Losses()
         except BaseException:
@@ -177,27 +180,39 @@ class Recording:
             part: where to begin; what is lost behind it is not counted.
         """
         losses = self.losses = Losses()
-        reader = PacketReader(self.topic)
+        timeline = self._timeline = Timeline(self.topic)
+        at = part.start
         for at, stored in self._source.read(self.topic, part, losses):
-            if not isinstance(stored, StoredMessage):
-                yield at, stored
-                continue
             if at >= part.end:
                 losses = Losses()
-            is_label = stored.schema == LabelMessage.SCHEMA_NAME
-            item: Packet | Label
             try:
-                if is_label:
-                    item = Label.from_cdr(stored.data)
-                else:
-                    item = reader.read(stored.schema, stored.data, stored.log_time_ns, stored.sequence)
-                    self._check_size(item)
-                    self.encoding = self.encoding or reader.encoding
+                for item in self._placed(timeline, stored):
+                    yield at, item
             except InputError as error:
+                assert isinstance(stored, StoredMessage)
                 where = f"topic {stored.topic!r}, message {stored.number} (byte {at}): {error}"
-                losses.add("bad label" if is_label else "bad packet", len(stored.data), where)
-            else:
-                yield at, item
+                kind = "bad label" if stored.schema == LabelMessage.SCHEMA_NAME else "bad packet"
+                losses.add(kind, len(stored.data), where)
+        for item in timeline.finish():
+            yield at, item
+
+    def _placed(self, timeline: Timeline, stored: SourceItem) -> Iterator[Packet | Label]:
+        if isinstance(stored, Packet):
+            yield from timeline.packet(stored)
+        elif isinstance(stored, Label):
+            yield from timeline.label(stored)
+        elif stored.schema == LabelMessage.SCHEMA_NAME:
+            yield from timeline.label(Label.from_cdr(stored.data))
+        else:
+            about = stored.log_time_ns, stored.sequence, stored.encoding
+            for item in timeline.message(stored.schema, stored.data, *about):
+                self.encoding = self.encoding or timeline.encoding
+                yield item
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        return self._timeline.counts
 
     def played(
         self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
@@ -214,22 +229,27 @@ class Recording:
             for t in self.topics
             if t.holds == "labels" or (t.holds == "events" and t.name == self.topic)
         )
-        for done, item in enumerate(self.items(), 1):
-            yield item
-            report(done, 0 if loop else total)
-        if not loop or self.first_us is None or self.last_us is None:
-            return
-        step_us = self.last_us - self.first_us + _LOOP_GAP_US
-        shift_us = 0
+        # Where a clock starts anew the times of one round are several spans: the next begins behind them all.
+        shift_us = epochs = 0
         while True:
-            shift_us += step_us
-            for item in self.items():
+            first_us = last_us = epoch = None
+            for done, item in enumerate(self.items(), 1):
                 if isinstance(item, Packet):
-                    events = item.events.copy()
-                    events["t"] += shift_us
-                    yield replace(item, events=events)
-                else:
-                    yield replace(item, start_us=item.start_us + shift_us)
+                    if len(item.events):
+                        t = item.events["t"]
+                        low, high = int(t.min()), int(t.max())
+                        first_us = low if first_us is None else min(first_us, low)
+                        last_us = high if last_us is None else max(last_us, high)
+                    epoch = item.epoch
+                if shift_us:
+                    item = _shifted(item, shift_us, epochs)
+                yield item
+                if not shift_us:
+                    report(done, 0 if loop else total)
+            if not loop or first_us is None or last_us is None:
+                return
+            shift_us += last_us - first_us + _LOOP_GAP_US
+            epochs += (epoch or 0) + bool(epoch)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the labelled samples in stored order; those of a part to their end, wherever that is.
@@ -283,18 +303,21 @@ class Recording:
         """Time from the earliest to the latest event."""
         return (self.last_us or 0) - (self.first_us or 0)
 
-    @staticmethod
-    def _check_size(packet: Packet) -> None:
-        height, width = packet.resolution
-        if height * width > MAX_PIXELS:
-            raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
-
     def _first_packet(self) -> Packet:
         for _, item in self.placed_items(WHOLE):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
+
+
+def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label:
+    if isinstance(item, Label):
+        return replace(item, start_us=item.start_us + shift_us)
+    events = item.events.copy()
+    events["t"] += shift_us
+    log_time_ns = item.log_time_ns + shift_us * 1000
+    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns)
 
 
 def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
