@@ -23,14 +23,15 @@ from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.locations import Location, absolute, location_of
 from streamfeat.messages.cdr import LabelMessage
-from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.messages.packets import Label, Packet
+from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.bags import assumptions_of
 from streamfeat.recordings.labels import read_labels, with_labels
 from streamfeat.recordings.opening import RecordingPath, open_source
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
-from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic, unpacked_message
+from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -129,6 +130,7 @@ class Recording:
             self.path, self.topics = self._source.path, self._source.topics
             self.topic = _choose_topic(self.path, self.topics, topic)
             self.encoding = ""
+            self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution
             self.losses = Losses()
         except BaseException:
@@ -215,45 +217,53 @@ class Recording:
     ) -> Iterator[tuple[int, Packet | Label]]:
         """Items of a part without their noise; what is taken out is counted in one part only."""
         denoiser = Denoiser(self._options.denoising)
-        before: dict[str, int] = {}
-        is_counted, is_labelled = part.start == 0 or not self.is_labelled, self.is_labelled
+        before, is_labelled = Counter[str](), self.is_labelled
+        is_counted = part.start == 0 or not is_labelled
         for at, item in placed:
             if is_labelled and isinstance(item, Label):
-                if not is_counted and at < part.end:
-                    before, is_counted = denoiser.removed, True
-                elif at >= part.end:
-                    is_counted = False
+                before = before if is_counted else Counter(denoiser.removed)
+                is_counted = at < part.end
             kept = denoiser.process(item)
             if is_counted:
-                self.losses.removed = Counter(denoiser.removed)
-                self.losses.removed.subtract(before)
+                self.losses.removed = Counter(denoiser.removed) - before
             yield at, kept
 
     def _stored_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
         """As `placed_items`, of what is in the files."""
         losses = self.losses = Losses()
-        reader = PacketReader(self.topic)
+        timeline = self._timeline = Timeline(self.topic)
+        at = part.start
         for at, stored in self._source.read(self.topic, part, losses):
-            if not isinstance(stored, StoredMessage):
-                yield at, stored
-                continue
             if at >= part.end:
                 losses = Losses()
-            is_label = stored.schema == LabelMessage.SCHEMA_NAME
-            item: Packet | Label
             try:
-                data = unpacked_message(stored.data)
-                if is_label:
-                    item = Label.from_cdr(data)
-                else:
-                    item = reader.read(stored.schema, data, stored.log_time_ns, stored.sequence)
-                    self._check_size(item)
-                    self.encoding = self.encoding or reader.encoding
+                for item in self._placed(timeline, stored):
+                    yield at, item
             except InputError as error:
+                assert isinstance(stored, StoredMessage)
                 where = f"topic {stored.topic!r}, message {stored.number} (byte {at}): {error}"
-                losses.add("bad label" if is_label else "bad packet", len(stored.data), where)
-            else:
-                yield at, item
+                kind = "bad label" if stored.schema == LabelMessage.SCHEMA_NAME else "bad packet"
+                losses.add(kind, len(stored.data), where)
+        for item in timeline.finish():
+            yield at, item
+
+    def _placed(self, timeline: Timeline, stored: SourceItem) -> Iterator[Packet | Label]:
+        if isinstance(stored, Packet):
+            yield from timeline.packet(stored)
+        elif isinstance(stored, Label):
+            yield from timeline.label(stored)
+        elif stored.schema == LabelMessage.SCHEMA_NAME:
+            yield from timeline.label(Label.from_cdr(unpacked_message(stored.data)))
+        else:
+            about = stored.log_time_ns, stored.sequence, stored.encoding
+            for item in timeline.message(stored.schema, unpacked_message(stored.data), *about):
+                self.encoding = self.encoding or timeline.encoding
+                yield item
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        return self._timeline.counts
 
     def played(
         self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
@@ -270,22 +280,27 @@ class Recording:
             for t in self.topics
             if t.holds == "labels" or (t.holds == "events" and t.name == self.topic)
         )
-        for done, item in enumerate(self.items(), 1):
-            yield item
-            report(done, 0 if loop else total)
-        if not loop or self.first_us is None or self.last_us is None:
-            return
-        step_us = self.last_us - self.first_us + _LOOP_GAP_US
-        shift_us = 0
+        # Where a clock starts anew the times of one round are several spans: the next begins behind them all.
+        shift_us = epochs = 0
         while True:
-            shift_us += step_us
-            for item in self.items():
+            first_us = last_us = epoch = None
+            for done, item in enumerate(self.items(), 1):
                 if isinstance(item, Packet):
-                    events = item.events.copy()
-                    events["t"] += shift_us
-                    yield replace(item, events=events)
-                else:
-                    yield replace(item, start_us=item.start_us + shift_us)
+                    if len(item.events):
+                        t = item.events["t"]
+                        low, high = int(t.min()), int(t.max())
+                        first_us = low if first_us is None else min(first_us, low)
+                        last_us = high if last_us is None else max(last_us, high)
+                    epoch = item.epoch
+                if shift_us:
+                    item = _shifted(item, shift_us, epochs)
+                yield item
+                if not shift_us:
+                    report(done, 0 if loop else total)
+            if not loop or first_us is None or last_us is None:
+                return
+            shift_us += last_us - first_us + _LOOP_GAP_US
+            epochs += (epoch or 0) + bool(epoch)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the labelled samples in stored order; those of a part to their end, wherever that is.
@@ -339,18 +354,21 @@ class Recording:
         """Time from the earliest to the latest event."""
         return (self.last_us or 0) - (self.first_us or 0)
 
-    @staticmethod
-    def _check_size(packet: Packet) -> None:
-        height, width = packet.resolution
-        if height * width > MAX_PIXELS:
-            raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
-
     def _first_packet(self) -> Packet:
         for _, item in self._stored_items(WHOLE):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
+
+
+def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label:
+    if isinstance(item, Label):
+        return replace(item, start_us=item.start_us + shift_us)
+    events = item.events.copy()
+    events["t"] += shift_us
+    log_time_ns = item.log_time_ns + shift_us * 1000
+    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns)
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
