@@ -159,6 +159,7 @@ def train(
     model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
+    groups: options.Groups = "block",
     mirror: options.Mirror = False,
     topic: TopicOption = None,
     cluster: ClusterOption = None,
@@ -171,10 +172,12 @@ def train(
     """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
+    from streamfeat.classify.folds import assign_folds, groups_named
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
+    kind = groups_named(groups)
     encoder = Encoder.load(model)
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
@@ -189,8 +192,10 @@ def train(
         images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
         report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, images)
+        sources = samples.sources[~samples.held_out].tolist()
+        parts = assign_folds(labels[: len(sources)], sources, folds, kind)
         trained = train_classifier(
-            rows, labels, encoder, groups=numbers, folds=folds, provenance={"mirror": mirror}
+            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
         )
     trained.save(classifier)
     held_out = samples.rows[samples.held_out]

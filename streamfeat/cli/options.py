@@ -1,7 +1,7 @@
 """Options for what learning can be told, as `learn` and `evaluate` have them.
 
 Lives here: each option once, and a setting made of those that were given.
-Not here: what they mean (`learn.setting`).
+Not here: what they mean (`learn.settings`).
 """
 
 from typing import Annotated, Any
@@ -17,6 +17,7 @@ __all__ = [
     "Downsample",
     "Encoding",
     "Filters",
+    "Groups",
     "Iterations",
     "LogDet",
     "MaxCount",
@@ -95,6 +96,15 @@ Seed = Annotated[int | None, typer.Option(help="Of every random choice.", show_d
 
 Mirror = Annotated[
     bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")
+]
+
+
+Groups = Annotated[
+    str,
+    typer.Option(
+        help="Samples that stay on one side of a fold: block, neighbours in the order of their sources; "
+        "source, those of one source; or none."
+    ),
 ]
 
 
