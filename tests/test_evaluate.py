@@ -21,7 +21,7 @@ from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_c
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
-from streamfeat.evaluate.methods import make_features, random_filters, spherical_means
+from streamfeat.evaluate.methods import make_features
 from streamfeat.evaluate.page import tiled
 from streamfeat.evaluate.plan import METHODS, Cell, Trial, parse_sweep, plan_cells
 from streamfeat.evaluate.run import StateFile, evaluate, state_path
@@ -29,6 +29,7 @@ from streamfeat.evaluate.splits import DataSet, Fold
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
 from streamfeat.learn.chunks import ChunkedVolumes
+from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.volumes import windows_of
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
 from streamfeat.report.machine import PeakMemory
@@ -207,7 +208,7 @@ def test_cells_are_the_base_and_one_change_at_a_time():
 
 
 def test_what_a_method_does_not_use_makes_no_other_cell():
-    base = {"iterations": 3, "log_det": 0.2, "coherence": 0.3, "patch": 5}
+    base = {"iterations": 3, "rows": "free", "log_det": 0.2, "coherence": 0.3, "patch": 5}
     direct, inverse, kmeans, counts = plan_cells(["direct", "inverse", "kmeans", "counts"], base, [], 1)
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
@@ -230,7 +231,7 @@ def test_any_value_of_a_setting_can_be_swept(text, values):
     name, found = parse_sweep(text)
     assert name == text.partition("=")[0].replace("-", "_")
     assert found == values
-    cells = plan_cells(["direct"], {}, [(name, found)], 1)
+    cells = plan_cells(["direct"], {"rows": "free"}, [(name, found)], 1)
     assert [getattr(cell.setting, name) for cell in cells[1:]] == values
 
 

@@ -95,8 +95,8 @@ def assign_folds(
         seed: of the shuffling.
 
     Raises:
-        InputError: a label is missing; a class has fewer samples, or sources, than folds; or all samples of a class would be in
-            one fold.
+        InputError: a label is missing; a class has fewer samples, or sources, than folds; or all samples of a
+            class would be in one fold.
     """
     check_labels(labels)
     if n < 2:

@@ -60,7 +60,10 @@ def learn(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
+    start: options.Start = None,
+    rows: options.Rows = None,
     conditioning: options.Conditioning = None,
     coherence: options.Coherence = None,
     log_det: options.LogDet = None,
@@ -121,13 +124,20 @@ def learn(
         "bytes": model.stat().st_size,
     }
     entries = encoder.geometry.entries
-    if encoder.formulation == "direct" and encoder.n_filters < entries:
+    if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
         result["log_determinant"] = (
             f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
         )
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
         print_losses(rec.losses)
+    if encoder.provenance["volumes"] < setting.volumes:
+        err.print(
+            f"[yellow]{encoder.provenance['volumes']:,} volumes[/] were learned from, not "
+            f"{setting.volumes:,}: no more with events were found in the recordings' "
+            f"{encoder.provenance['windows']:,} windows",
+            soft_wrap=True,
+        )
     if encoder.provenance["interrupted"]:
         err.print(
             f"[yellow]interrupted[/] after {encoder.provenance['iterations']} iterations; "

@@ -19,13 +19,16 @@ __all__ = [
     "Filters",
     "Groups",
     "Iterations",
+    "Lambda0",
     "LogDet",
     "MaxCount",
     "Mirror",
     "Patch",
     "Pooling",
     "Preset",
+    "Rows",
     "Seed",
+    "Start",
     "Stride",
     "Threshold",
     "Volumes",
@@ -72,19 +75,40 @@ Pooling = Annotated[
         help="Cells along each side, in each of which codes are summed.", show_default=_shown("pooling")
     ),
 ]
+Lambda0 = Annotated[
+    float | None,
+    typer.Option(
+        help="Sparsity penalty in learning.", show_default="2 if direct (0.5 with free rows), 1 if inverse"
+    ),
+]
 Threshold = Annotated[
     float | None,
-    typer.Option(help="Sparsity penalty lambda0.", show_default="0.5 if direct, 1 if inverse"),
+    typer.Option(
+        help="Threshold of encoding, in units of unit-length filters.", show_default=_shown("threshold")
+    ),
+]
+Start = Annotated[
+    str | None, typer.Option(help="Of learning: kmeans or random.", show_default=_shown("start"))
+]
+Rows = Annotated[
+    str | None,
+    typer.Option(
+        help="Length of the filters while they are learned: unit, or free; direct only.",
+        show_default=_shown("rows"),
+    ),
 ]
 Conditioning = Annotated[
-    float | None, typer.Option(help="Weight of |A|^2 / 2; direct only.", show_default="0.1")
+    float | None, typer.Option(help="Weight of |A|^2 / 2; free rows only.", show_default="0.1")
 ]
 Coherence = Annotated[
     float | None,
-    typer.Option(help="Weight of |A'A - I|^2 / 4.", show_default="0.02 if direct, 0.1 if inverse"),
+    typer.Option(
+        help="Weight of |A'A - I|^2 / 4; free rows or inverse only.",
+        show_default="0.02 if direct, 0.1 if inverse",
+    ),
 ]
 LogDet = Annotated[
-    float | None, typer.Option(help="Weight of -log|det A'A|; direct only.", show_default="0.1")
+    float | None, typer.Option(help="Weight of -log|det A'A|; free rows only.", show_default="0.1")
 ]
 Volumes = Annotated[
     int | None, typer.Option(help="Local volumes to learn from.", show_default=_shown("volumes"))

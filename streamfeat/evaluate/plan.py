@@ -24,8 +24,8 @@ METHODS = {
 }
 """Every method, and what it is."""
 
-_LEARNING = {"iterations", "conditioning", "coherence", "log_det"}
-_NOT_USED = {"inverse": {"conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
+_LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
+_NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
 _USED_WITHOUT_FILTERS = {"hats": ("mirror",), "hots": ("seed", "mirror"), "counts": ("mirror",)}
 
 
@@ -112,6 +112,7 @@ _KINDS: dict[type, tuple[Any, str]] = {
     int: (int, "integers, such as --sweep {name}=2,4,7"),
     str: (_name, "names, such as --sweep {name}=soft,split"),
     bool: (_truth, "yes and no, such as --sweep {name}=yes,no"),
+    float: (float, "numbers, such as --sweep {name}=0.25,0.5"),
     type(None): (float, "numbers, such as --sweep {name}=0.25,0.5"),
 }
 """By the type of the default: how a value is read, and what to give; None stands in for a number."""
