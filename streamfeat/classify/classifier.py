@@ -85,6 +85,11 @@ class Classifier:
         object.__setattr__(self, "_folded", folded)
         object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
 
+    @property
+    def linear(self) -> "Classifier":
+        """Itself: what can learn online and keep pace with single events."""
+        return self
+
     @classmethod
     def untrained(cls, labels: Sequence[str], encoder: FeatureMap) -> Self:
         """A classifier of zeros, for learning online from nothing.
@@ -138,13 +143,17 @@ class Classifier:
 
     def save(self, path: str | Path) -> None:
         """Write one safetensors file; the file appears whole or not at all."""
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, *self.parts())
+
+    def parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """The arrays and the header of its file."""
         arrays = {name: getattr(self, name) for name in ("centre", "scale", "weights", "bias")}
         header = {
             "labels": list(self.labels),
             "fingerprint": self.fingerprint,
             "provenance": dict(self.provenance),
         }
-        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
+        return arrays, header
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -153,7 +162,13 @@ class Classifier:
         Raises:
             InputError: the file is missing, cut short, of another version, or not a classifier.
         """
-        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        return cls.from_parts(path, *read_safetensors(Path(path), _KIND, FORMAT_VERSION))
+
+    @classmethod
+    def from_parts(
+        cls, path: str | Path, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+    ) -> Self:
+        """Check what a file holds, as `load` does."""
         fingerprint, provenance = header.get("fingerprint"), header.get("provenance", {})
         labels = header["labels"] if isinstance(header.get("labels"), list) else []
         sound = all(isinstance(name, str) for name in labels) and len(set(labels)) == len(labels) >= 2

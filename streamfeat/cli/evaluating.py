@@ -79,6 +79,7 @@ def evaluate(
     iterations: options.Iterations = None,
     seed: options.Seed = None,
     mirror: options.Mirror = False,
+    kernel: options.Kernel = "linear",
     on: Annotated[
         str,
         typer.Option(
@@ -122,7 +123,7 @@ def evaluate(
             refuse_existing(path, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror}
+    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel}
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:

@@ -35,6 +35,8 @@ from streamfeat.cli.program import (
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
+    from streamfeat.classify.classifier import Classifier
+    from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
 
@@ -171,6 +173,7 @@ def train(
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
@@ -179,15 +182,20 @@ def train(
     verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
+    """Train a classifier on labelled samples; splits named validation or test are only scored."""
+    import numpy as np
+
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
+    from streamfeat.classify.kernel import train_kernel_classifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
     kind = groups_named(groups)
+    if kernel not in ("linear", "rbf"):
+        raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
     encoder = Encoder.load(model)
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
@@ -207,17 +215,21 @@ def train(
         trained = train_classifier(
             rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
         )
-    trained.save(classifier)
+    found: Classifier | KernelClassifier = trained
+    if kernel == "rbf":
+        found = train_kernel_classifier(rows, trained, np.asarray(labels))
+    found.save(classifier)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
         "labels": ", ".join(trained.labels),
+        "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
     if len(held_out):
-        predicted = [trained.predict(row) for row in held_out]
+        predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
     print_result(result, "trained", as_json=as_json)

@@ -19,6 +19,7 @@ __all__ = [
     "Filters",
     "Groups",
     "Iterations",
+    "Kernel",
     "Lambda0",
     "LogDet",
     "MaxCount",
@@ -122,6 +123,14 @@ Mirror = Annotated[
     bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")
 ]
 
+
+Kernel = Annotated[
+    str,
+    typer.Option(
+        help="Of the classifier: linear, or rbf, which is more accurate and takes about a millisecond for an "
+        "emission; --emit event and --learn-online use the linear one beside it."
+    ),
+]
 
 Groups = Annotated[
     str,

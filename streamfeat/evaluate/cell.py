@@ -12,6 +12,7 @@ import numpy as np
 from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.classify.folds import assign_folds
+from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
@@ -100,7 +101,10 @@ def _scored(
     rows, labels, numbers = training_set(samples, images if cell.setting.mirror else None)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
-    classifier = train_classifier(rows, labels, features, parts=parts[numbers])
+    classifier: Classifier | KernelClassifier
+    classifier = linear = train_classifier(rows, labels, features, parts=parts[numbers])
+    if cell.setting.kernel == "rbf":
+        classifier = train_kernel_classifier(rows, linear, np.asarray(labels))
     trained = time.perf_counter()
     report("training", 1, 1, "")
     predicted = predict_all(classifier, samples.rows[samples.held_out])
@@ -120,7 +124,7 @@ def _scored(
 def _looked_into(
     cell: Cell,
     features: FeatureMap,
-    classifier: Classifier,
+    classifier: Classifier | KernelClassifier,
     samples: EncodedSamples,
     recordings: Sequence[Recording],
     report: Report,

@@ -26,7 +26,8 @@ METHODS = {
 
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
-_USED_WITHOUT_FILTERS = {"hats": ("mirror",), "hots": ("seed", "mirror"), "counts": ("mirror",)}
+_TRAINING = ("mirror", "kernel")
+_USED_WITHOUT_FILTERS = {"hats": _TRAINING, "hots": ("seed", *_TRAINING), "counts": _TRAINING}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,9 +36,17 @@ class Trial(Setting):
 
     Attributes:
         mirror: train on mirror images of the training samples as well.
+        kernel: `linear`, or `rbf`.
     """
 
     mirror: bool = False
+    kernel: str = "linear"
+
+    def __post_init__(self) -> None:
+        """Check the kernel, and all that `Setting` checks."""
+        if self.kernel not in ("linear", "rbf"):
+            raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
+        Setting.__post_init__(self)
 
 
 _DEFAULTS = {field.name: field.default for field in fields(Trial)}
@@ -77,7 +86,7 @@ class Cell:
 
     def has_features_of(self, other: "Cell") -> bool:
         """Whether the same features serve both, so that they need not be made twice."""
-        mine, others = (replace(cell.setting, mirror=False) for cell in (self, other))
+        mine, others = (replace(cell.setting, mirror=False, kernel="linear") for cell in (self, other))
         return (self.method, self.fold, mine) == (other.method, other.fold, others)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from streamfeat.classify.classifier import Classifier, OnlineClassifier
 from streamfeat.classify.features import encode_samples
+from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.engine.encoder import FeatureMap
 from streamfeat.recordings.reader import Sample
 
@@ -83,13 +84,13 @@ def confusion(true: Sequence[str], predicted: Sequence[str], names: Sequence[str
     return [[int(count) for count in row] for row in matrix]
 
 
-def predict_all(classifier: Classifier, features: NDArray[np.float32]) -> list[str]:
+def predict_all(classifier: Classifier | KernelClassifier, features: NDArray[np.float32]) -> list[str]:
     """The label with the highest score for each row of `(n, F)` features."""
     return [classifier.labels[i] for i in classifier.scores(features).argmax(axis=-1)]
 
 
 def early_decision(
-    features: FeatureMap, classifier: Classifier, samples: Sequence[Sample]
+    features: FeatureMap, classifier: Classifier | KernelClassifier, samples: Sequence[Sample]
 ) -> dict[str, list[dict[str, float]]]:
     """Accuracy when a sample has been seen for some time only, or some of its events.
 

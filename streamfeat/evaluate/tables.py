@@ -181,7 +181,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     lines = [
         f"{', '.join(result['recordings'])}: {samples['training']:,} samples to learn from, "
         f"{samples['held_out']:,} held out; split: {result['split']}; {result['interval']}.",
-        "Every method's features go through the same normalisation and linear SVM. Encoding is of all "
+        "Every method's features go through the same normalisation and classifier, a linear SVM or, with "
+        "kernel rbf, Gaussian kernel ridge. Encoding is of all "
         "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
     if leakage := result["leakage"]:

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 from rich.console import Console
 
 from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
@@ -68,7 +69,7 @@ class ReplayJob:
         self._topic = topic
         self._recording = recording
         encoder = Encoder.load(model)
-        reader = Classifier.load(classifier) if classifier else None
+        reader = load_classifier(classifier) if classifier else None
         with open_recording(recording, topic) as rec:
             encoder.geometry.grid_shape(rec.resolution)
             if learn_online and reader is None:
