@@ -3,11 +3,9 @@
 import http.client
 import re
 import socket
-import sys
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from live_net import PATIENCE_S, until
 
 pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+from browser import Browser, find_chromium
 
 from streamfeat.errors import InputError
 from streamfeat.stream.emission import Emission
@@ -24,7 +22,6 @@ from streamfeat.view.channels import LiveBoard
 from streamfeat.view.job import View
 from streamfeat.view.page import PageServer, page
 from streamfeat.view.sink import ViewSink, about
-from tools.browser import Browser, find_chromium
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)

@@ -89,7 +89,7 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
 
     A labelled sample gives one window, which ends with the sample; samples of a held-out split
     (validation, test) are passed over. Without labels a window begins with the first event that the one
-    before does not reach, wherever packets end.
+    before does not reach, wherever packets end. Where the camera's clock starts anew, so does a window.
 
     Args:
         items: packets and labels in stored order, as `Recording.items` gives them.
@@ -98,7 +98,7 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
     label: Label | None = None
     pending: list[Events] = []
     resolution: Resolution = (0, 0)
-    origin = 0
+    origin = epoch = 0
 
     def window() -> Iterator[Window]:
         if pending and not (label and label.split in HELD_OUT_SPLITS):
@@ -111,9 +111,9 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
             yield from window()
             label, origin = item, item.start_us
         elif len(item.events):
-            if item.resolution != resolution:
+            if (item.resolution, item.epoch) != (resolution, epoch):
                 yield from window()
-                resolution = item.resolution
+                resolution, epoch = item.resolution, item.epoch
             rest = item.events
             while label is None and len(rest):
                 first = int(rest["t"][0])

@@ -123,10 +123,14 @@ class _Cutter:
 
     def __init__(self, encoding: str) -> None:
         self._writer = PacketWriter(encoding)
+        self._epoch = 0
         self.events = 0
 
     def process(self, item: Packet | Label) -> Iterator[EventPacket | LabelMessage]:
         if isinstance(item, Packet):
+            if item.epoch != self._epoch:
+                self._epoch = item.epoch
+                self._writer.restart()
             yield from self._writer.messages(item.events, item.resolution)
             self.events += len(item.events)
         else:

@@ -146,7 +146,7 @@ class Pipeline(Generic[In, Out]):
             groups = _full_groups(self._items)
         else:
             groups = _paced_groups(self._items, round(_PACED_SLICE_US * max(self._speed, 1.0)))
-        started: tuple[float, int] | None = None
+        pace = _Pace(self._speed)
         while not self._stop.is_set():
             try:
                 group = await loop.run_in_executor(threads, self._advance, groups)
@@ -157,9 +157,7 @@ class Pipeline(Generic[In, Out]):
                 break
             t_us = _stream_time(group)
             if self._speed is not None and t_us is not None:
-                started = started or (time.monotonic(), t_us)
-                due = started[0] + (t_us - started[1]) / (1e6 * self._speed)
-                await self._sleep_until(due)
+                await self._sleep_until(pace.due(group[-1], t_us, time.monotonic()))
             self._under_way += 1
             await self._inbox.put(group)
             self._stats.items += len(group)
@@ -338,6 +336,34 @@ def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[_Group[
             stop = int(np.searchsorted(latest, latest[start] + slice_us))
             yield _Group([replace(item, events=item.events[start:stop])])
             start = stop
+
+
+class _Pace:
+    """When items are due: stream time goes on across restarts of the camera's clock.
+
+    Args:
+        speed: stream seconds for each second of the clock; None for no pace.
+    """
+
+    def __init__(self, speed: float | None) -> None:
+        self._speed = speed or 1.0
+        self._epoch: int | None = None
+        self._origin_us = self._passed_us = 0
+        self._began_s = 0.0
+
+    def due(self, item: object, t_us: int, now_s: float) -> float:
+        """The clock's time for an item that is complete at stream time `t_us`."""
+        if isinstance(item, Packet) and item.epoch != self._epoch:
+            # The first packet of an epoch is due at once, the others by their distance from it.
+            self._began_s = now_s if self._epoch is None else max(now_s, self._began_s + self._passed_s())
+            self._epoch, self._origin_us = item.epoch, t_us
+        elif self._epoch is None:
+            self._epoch, self._origin_us, self._began_s = 0, t_us, now_s
+        self._passed_us = max(t_us - self._origin_us, 0)
+        return self._began_s + self._passed_s()
+
+    def _passed_s(self) -> float:
+        return self._passed_us / (1e6 * self._speed)
 
 
 def _stream_time(group: Sequence[object]) -> int | None:
