@@ -36,6 +36,8 @@ from streamfeat.cli.reading import print_assumptions, print_removed, reads_recor
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
+    from streamfeat.classify.classifier import Classifier
+    from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
     from streamfeat.recordings.options import ReadOptions
@@ -64,7 +66,10 @@ def learn(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
+    start: options.Start = None,
+    rows: options.Rows = None,
     conditioning: options.Conditioning = None,
     coherence: options.Coherence = None,
     log_det: options.LogDet = None,
@@ -127,7 +132,7 @@ def learn(
         "bytes": model.stat().st_size,
     }
     entries = encoder.geometry.entries
-    if encoder.formulation == "direct" and encoder.n_filters < entries:
+    if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
         result["log_determinant"] = (
             f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
         )
@@ -135,6 +140,13 @@ def learn(
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
+    if encoder.provenance["volumes"] < setting.volumes:
+        err.print(
+            f"[yellow]{encoder.provenance['volumes']:,} volumes[/] were learned from, not "
+            f"{setting.volumes:,}: no more with events were found in the recordings' "
+            f"{encoder.provenance['windows']:,} windows",
+            soft_wrap=True,
+        )
     if encoder.provenance["interrupted"]:
         err.print(
             f"[yellow]interrupted[/] after {encoder.provenance['iterations']} iterations; "
@@ -168,7 +180,9 @@ def train(
     model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
+    groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
@@ -177,13 +191,20 @@ def train(
     verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
+    """Train a classifier on labelled samples; splits named validation or test are only scored."""
+    import numpy as np
+
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
+    from streamfeat.classify.folds import assign_folds, groups_named
+    from streamfeat.classify.kernel import train_kernel_classifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
+    kind = groups_named(groups)
+    if kernel not in ("linear", "rbf"):
+        raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
     encoder = Encoder.load(model)
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
@@ -202,20 +223,26 @@ def train(
         images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
         report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, images)
+        sources = samples.sources[~samples.held_out].tolist()
+        parts = assign_folds(labels[: len(sources)], sources, folds, kind)
         trained = train_classifier(
-            rows, labels, encoder, groups=numbers, folds=folds, provenance={"mirror": mirror}
+            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
         )
-    trained.save(classifier)
+    found: Classifier | KernelClassifier = trained
+    if kernel == "rbf":
+        found = train_kernel_classifier(rows, trained, np.asarray(labels))
+    found.save(classifier)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
         "labels": ", ".join(trained.labels),
+        "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
     if len(held_out):
-        predicted = [trained.predict(row) for row in held_out]
+        predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
     print_result(result, "trained", as_json=as_json)

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.live import Live
 
-from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
 from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
@@ -107,7 +107,7 @@ class ListenJob:
         """Open and check everything but the network, before anything is written."""
         self._policy = EmitPolicy.parse(emit)
         self._encoder = Encoder.load(model)
-        self._classifier = Classifier.load(classifier) if classifier else None
+        self._classifier = load_classifier(classifier) if classifier else None
         if self._classifier:
             self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
         elif learn_online:

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 from rich.console import Console
 
 from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
@@ -71,7 +72,7 @@ class ReplayJob:
         self._topic, self._reading = topic, reading
         self._recording = recording
         encoder = Encoder.load(model)
-        reader = Classifier.load(classifier) if classifier else None
+        reader = load_classifier(classifier) if classifier else None
         with open_recording(recording, topic, reading) as rec:
             self.assumptions = rec.assumptions
             encoder.geometry.grid_shape(rec.resolution)

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Event, current_thread, main_thread
 from typing import Any
 
-from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
@@ -95,7 +95,7 @@ class View:
             if isinstance(source, Location)
             else ListenJob(source, engine_of=self._engine_of, **common)
         )
-        self._labels = Classifier.load(classifier).labels if classifier else ()
+        self._labels = load_classifier(classifier).labels if classifier else ()
 
     def run(self, **options: Any) -> None:
         """Show the source to its end or to SIGINT.
