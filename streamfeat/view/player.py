@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from streamfeat.events import Events
-from streamfeat.messages.packets import Label, Packet
+from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.reader import Recording
 
 __all__ = ["Player", "Timeline", "items_between"]
@@ -97,6 +97,7 @@ class Player:
         self._seeks = 0
         self._at_us = 0
         self._due: tuple[float, int] | None = None
+        self._open_label: Label | None = None
 
     def pause(self, paused: bool) -> None:
         """Stand still, or go on."""
@@ -137,22 +138,26 @@ class Player:
             "speed": self._speed,
         }
 
-    def __iter__(self) -> Iterator[Item | None]:
+    def __iter__(self) -> Iterator[Item | Watermark | None]:
         """Yield items when they are due; None before a wait, so that what was given is not held back."""
         start_us = 0
         while (outcome := (yield from self._play(start_us))) != "stop":
+            if outcome == "end" and not self._loop:
+                self._ended = True
+                self._on_change(self.state())
+                if not self._stays:
+                    return
+                if self._open_label:
+                    # Nothing else says that the last sample is over.
+                    label = self._open_label
+                    yield Watermark(self._recording.topic, label.start_us + label.duration_us)
+                yield None
+                with self._changed:
+                    self._changed.wait_for(lambda: self._seek_us is not None or self._stopped)
             with self._changed:
-                if outcome == "end" and not self._loop:
-                    self._ended = True
-                    self._on_change(self.state())
-                    if not self._stays:
-                        return
-                    yield None
-                    while self._seek_us is None and not self._stopped:
-                        self._changed.wait(0.1)
                 start_us, self._seek_us = self._seek_us or 0, None
                 self._seeks += 1
-                self._ended, self._due = False, None
+                self._ended, self._due, self._open_label = False, None, None
 
     def _play(self, start_us: int) -> Generator[Item | None, None, Outcome]:
         """Play from a time to the end, or until told otherwise: how it ended."""
@@ -163,6 +168,7 @@ class Player:
                 return "stop"
             if isinstance(item, Label):
                 if start_us <= played.us or start_us == 0:
+                    self._open_label = item
                     yield item
                 continue
             if len(item.events):
@@ -246,14 +252,14 @@ class Timeline:
                     return
                 if not isinstance(item, Packet) or len(item.events) == 0:
                     continue
-                before_us = played.us
                 at_us = played.add(item.events)
                 while at_us // column_us >= _MOST_COLUMNS:
                     counts[: _MOST_COLUMNS // 2] = counts.reshape(-1, 2).sum(axis=1)
                     counts[_MOST_COLUMNS // 2 :] = 0
                     column_us *= 2
-                first, last = before_us // column_us, at_us // column_us
-                counts[first : last + 1] += len(item.events) // (last - first + 1)
+                t = item.events["t"]
+                columns = (at_us - (t.max() - t)).clip(0) // column_us
+                counts += np.bincount(columns, minlength=_MOST_COLUMNS)
                 if started > told + 0.5:
                     told = started
                     self._tell(self._record(counts, column_us, at_us, done=False))

@@ -65,7 +65,6 @@ class ViewSink:
         self._drops = drops
         self._slots: dict[str, Slot] = {}
         self._paces: dict[str, Pace] = {}
-        self._sights: dict[str, Sight] = {}
         self._judged: dict[str, list[int]] = {}
         self.frames = 0
 
@@ -125,19 +124,19 @@ class ViewSink:
             "events": seen.events,
             "events_per_s": round(seen.events_per_s),
             "drops": dict(self._drops()) | {"skipped": self.skipped},
-        } | _engine_status(self._sights.get(seen.topic))
+        }
         for board in self._boards:
             board.picture(self._prefix(seen.topic), "events", seen.now_us, picture)
             board.record(self._prefix(seen.topic), "status", seen.now_us, status)
 
     def _draw(self, sight: Sight) -> None:
         assert self._encoder
-        self._sights[sight.topic] = sight
         bins = bins_picture(sight.counts, self._encoder.geometry.max_count)
         volumes = volume_picture(sight.activity)
         for board in self._boards:
             board.picture(self._prefix(sight.topic), "bins", sight.now_us, bins)
             board.picture(self._prefix(sight.topic), "volumes", sight.now_us, volumes)
+            board.record(self._prefix(sight.topic), "engine", sight.now_us, _engine_record(sight))
 
     def _tell(self, e: Emission) -> None:
         assert self._encoder
@@ -174,12 +173,10 @@ class ViewSink:
         }
 
 
-def _engine_status(sight: Sight | None) -> dict[str, Any]:
-    """What is said of an engine; nothing where there is none yet."""
-    if sight is None:
-        return {}
+def _engine_record(sight: Sight) -> dict[str, Any]:
     updates = sight.updates
     return {
+        "t_s": sight.now_us / 1e6,
         "active_volumes": int(np.count_nonzero(sight.activity)),
         "volumes": sight.activity.size,
         "update_us": {

@@ -21,7 +21,7 @@ from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake, Warnings
 from streamfeat.live.names import Names
 from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
-from streamfeat.messages.packets import Label, Packet
+from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.reader import Recording, open_recording
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
@@ -123,8 +123,8 @@ class PlayJob:
         started = time.perf_counter()
         try:
             with self._recording, signals_wait():
-                processor: Processor[Packet | Label, Emission] = self._session or NoFeatures()
-                pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
+                processor: Processor[Packet | Label | Watermark, Emission] = self._session or NoFeatures()
+                pipeline: Pipeline[Packet | Label | Watermark, Emission] = Pipeline(
                     tap.items(self.player), processor, [sink]
                 )
                 self.interrupted = run_until_interrupted([pipeline], self.player.stop)

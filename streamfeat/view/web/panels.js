@@ -80,10 +80,10 @@ const listener = {
       if (message.frame !== model.frame) model.frames++;
       model.frame = message.frame;
       if (model.firstS === null || message.t_s < model.firstS) model.firstS = message.t_s;
-      if (message.update_us?.n) {
-        const { median, max } = message.update_us;
-        keep(model.latency, { t: message.t_s, values: [median, max], part: 0 });
-      }
+    }
+    if (channel === "engine" && message.update_us.n) {
+      const { median, max } = message.update_us;
+      keep(model.latency, { t: message.t_s, values: [median, max], part: 0 });
     }
     if (channel === "prediction") {
       const { t_s: t, scores, sample, label } = message;
@@ -114,7 +114,7 @@ function drawAll() {
   dirty = false;
   const { about } = model;
   const { last } = model.cameras.get(model.camera) ?? { last: {} };
-  const { status, events, bins, volumes, features } = last;
+  const { status, engine, events, bins, volumes, features } = last;
   document.body.dataset.frames = model.frames;
   document.body.dataset.missed = model.missed;
   const startS = model.absolute ? 0 : model.firstS ?? 0;
@@ -131,7 +131,7 @@ function drawAll() {
       `stride ${about.stride}, ${about.bins} bins of ${ms(binMs)}`;
     at("bins-note").textContent = `signed counts, clipped at ±${about.max_count}, in each time bin`;
   }
-  at("volumes-note").textContent = status?.volumes ? `${status.active_volumes} of ${status.volumes}` : "";
+  at("volumes-note").textContent = engine ? `${engine.active_volumes} of ${engine.volumes}` : "";
   panel("events", events, (canvas) => drawPicture(canvas, events, signedColours()));
   panel("bins", bins && about?.bins, (canvas) => {
     const n = Number(about.bins);
@@ -154,7 +154,7 @@ function drawAll() {
       label: duration,
     }),
   );
-  if (status) drawCounts(status);
+  if (status) drawCounts(status, engine);
 }
 
 function drawFeatures(canvas, features) {
@@ -242,15 +242,15 @@ function drawVerdict({ label, sample, samples, right, incomplete }) {
   if (incomplete) verdict.append(" · packets are missing");
 }
 
-function drawCounts(status) {
+function drawCounts(status, engine) {
   const rows = [
     ["events", status.events.toLocaleString("en")],
     ["event rate", `${status.events_per_s.toLocaleString("en")} /s`],
     ["sensor", `${status.width} × ${status.height} pixels`],
-    ...(status.update_us
+    ...(engine
       ? [
-          ["update, median", duration(status.update_us.median)],
-          ["update, longest", duration(status.update_us.max)],
+          ["update, median", duration(engine.update_us.median)],
+          ["update, longest", duration(engine.update_us.max)],
         ]
       : []),
   ].map(([name, value]) => [name, value, false]);
