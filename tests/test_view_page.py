@@ -192,7 +192,7 @@ def test_a_browser_that_goes_is_nobodys_error(server, capfd):
 
 
 def test_a_web_port_in_use_is_one_clear_line(server):
-    with pytest.raises(InputError, match=f"--web-port {server.port}: cannot listen there: .*in use"):
+    with pytest.raises(InputError, match=f"--web-port {server.port}: cannot listen there: Address already in use"):
         PageServer(page, server.port)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from streamfeat.events import Events
 from streamfeat.messages.packets import Label, Packet, Watermark
-from streamfeat.recordings.reader import Recording
+from streamfeat.recordings.reader import Losses, Recording
 
 __all__ = ["Player", "Timeline", "items_between"]
 
@@ -68,7 +68,7 @@ class Player:
     """The items of a recording, each when it is due. Steered from any thread, iterated by one.
 
     Args:
-        recording: an open one; read from its start again for each seek.
+        opening: opens the recording, which is read from its start again for each seek.
         choose: makes the items that are played of those of the recording.
         speed: played seconds for each second of the clock; None for as fast as possible.
         loop: start again at the end.
@@ -78,7 +78,7 @@ class Player:
 
     def __init__(
         self,
-        recording: Recording,
+        opening: Callable[[], Recording],
         choose: Callable[[Iterator[Item]], Iterator[Item]] = lambda items: items,
         *,
         speed: float | None = 1.0,
@@ -87,7 +87,8 @@ class Player:
         on_change: Callable[[dict[str, Any]], None] = lambda state: None,
     ) -> None:
         """Nothing is read before iteration."""
-        self._recording, self._choose, self._loop, self._stays = recording, choose, loop, stays
+        self._opening, self._choose, self._loop, self._stays = opening, choose, loop, stays
+        self.losses = Losses()
         self._on_change = on_change
         self._changed = Condition()
         self._speed = speed
@@ -120,7 +121,8 @@ class Player:
     def seek(self, played_us: int) -> None:
         """Go on from another time, counted from the start."""
         with self._changed:
-            self._seek_us, self._due = max(played_us, 0), None
+            self._seek_us = self._at_us = max(played_us, 0)
+            self._due = None
             self._changed.notify_all()
 
     def stop(self) -> None:
@@ -140,8 +142,12 @@ class Player:
 
     def __iter__(self) -> Iterator[Item | Watermark | None]:
         """Yield items when they are due; None before a wait, so that what was given is not held back."""
+        with self._opening() as recording:
+            yield from self._items(recording)
+
+    def _items(self, recording: Recording) -> Iterator[Item | Watermark | None]:
         start_us = 0
-        while (outcome := (yield from self._play(start_us))) != "stop":
+        while (outcome := (yield from self._play(recording, start_us))) != "stop":
             if outcome == "end" and not self._loop:
                 self._ended = True
                 self._on_change(self.state())
@@ -150,7 +156,7 @@ class Player:
                 if self._open_label:
                     # Nothing else says that the last sample is over.
                     label = self._open_label
-                    yield Watermark(self._recording.topic, label.start_us + label.duration_us)
+                    yield Watermark(recording.topic, label.start_us + label.duration_us)
                 yield None
                 with self._changed:
                     self._changed.wait_for(lambda: self._seek_us is not None or self._stopped)
@@ -159,11 +165,12 @@ class Player:
                 self._seeks += 1
                 self._ended, self._due, self._open_label = False, None, None
 
-    def _play(self, start_us: int) -> Generator[Item | None, None, Outcome]:
+    def _play(self, recording: Recording, start_us: int) -> Generator[Item | None, None, Outcome]:
         """Play from a time to the end, or until told otherwise: how it ended."""
         played = PlayedTime()
         slice_us = round(_SLICE_US * max(self._speed or 1.0, 1.0))
-        for item in items_between(self._choose(iter(self._recording.items())), slice_us):
+        for item in items_between(self._choose(iter(recording.items())), slice_us):
+            self.losses = recording.losses
             if self._stopped:
                 return "stop"
             if isinstance(item, Label):

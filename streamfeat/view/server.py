@@ -15,6 +15,7 @@ the browser is text, `{"op": ..., "value": ...}`, of 4,096 bytes at most.
 import asyncio
 import hmac
 import json
+import os
 import secrets
 import struct
 from collections.abc import Callable
@@ -78,7 +79,7 @@ class PageServer:
         ready.wait()
         if self._problem:
             self._thread.join()
-            reason = self._problem.strerror or self._problem
+            reason = os.strerror(self._problem.errno) if self._problem.errno else self._problem
             raise InputError(f"--web-port {port}: cannot listen there: {reason}; give another --web-port")
         self._page = make_page(self.port, self._token).encode()
 

@@ -91,23 +91,18 @@ class PlayJob:
         """Open and check everything."""
         self._opening: Callable[[], Recording] = partial(open_recording, source, topic)
         self._on_timeline = on_timeline
-        self._recording = self._opening()
-        try:
+        with self._opening() as recording:
             if encoder:
-                encoder.geometry.grid_shape(self._recording.resolution)
-            if split is not None and split not in {label.split for label in self._recording.labels}:
+                encoder.geometry.grid_shape(recording.resolution)
+            if split is not None and split not in {label.split for label in recording.labels}:
                 raise InputError(f"{source}: has no samples of split {split!r}")
-            self._session = (
-                Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine)
-                if encoder
-                else None
-            )
-        except BaseException:
-            self._recording.close()
-            raise
-        self._split = split
+        self._session = (
+            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine)
+            if encoder
+            else None
+        )
         self.player = Player(
-            self._recording,
+            self._opening,
             lambda items: items_of_split(items, split),
             speed=speed,
             loop=loop,
@@ -122,7 +117,7 @@ class PlayJob:
         timeline = Timeline(self._opening, self._on_timeline) if self._on_timeline else None
         started = time.perf_counter()
         try:
-            with self._recording, signals_wait():
+            with signals_wait():
                 processor: Processor[Packet | Label | Watermark, Emission] = self._session or NoFeatures()
                 pipeline: Pipeline[Packet | Label | Watermark, Emission] = Pipeline(
                     tap.items(self.player), processor, [sink]
@@ -139,7 +134,7 @@ class PlayJob:
 
     def drops(self) -> dict[str, int]:
         """What did not come to bear so far, by reason; may be called from another thread."""
-        lost = sum(list(self._recording.losses.counts.values()))
+        lost = sum(list(self.player.losses.counts.values()))
         if self._session is None:
             return {"lost": lost}
         stats = self._session.stats()
