@@ -52,7 +52,7 @@ ROOMS = {
 """Each room, and the rooms above it that it may import from."""
 
 ONLY_IN = {
-    "asyncio": {"stream", "latency"},
+    "asyncio": {"stream", "latency", "view"},
     "mcap": {"recordings"},
     "zenoh": {"live"},
     "prometheus_client": {"live"},
@@ -65,6 +65,7 @@ ONLY_IN = {
     "dask": {"work"},
     "distributed": {"work"},
     "foxglove": {"view"},
+    "websockets": {"view"},
     "numba": {"kernels", "latency", "cli"},
 }
 """The rooms that may import a library."""

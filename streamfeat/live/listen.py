@@ -6,7 +6,7 @@ Not here: each of the parts.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -75,6 +75,7 @@ class ListenJob:
             of one who goes on with the cameras of another.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
+        tap: what items pass through before anything is computed from them.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -103,6 +104,7 @@ class ListenJob:
         joins_late: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
+        tap: Callable[[Iterable[Any]], Iterable[Any]] = lambda items: items,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = EmitPolicy.parse(emit)
@@ -120,7 +122,7 @@ class ListenJob:
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._reliable = learn_online, reliable
-        self._engine_of = engine_of
+        self._engine_of, self._tap = engine_of, tap
         self._zenoh_config, self._port = zenoh_config, port
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
@@ -192,7 +194,7 @@ class ListenJob:
                 sinks[-1] if isinstance(sinks[-1], Checkpointer) else self.health
             )
             pipeline: Pipeline[StreamItem | CameraLeft | Barrier, Emission] = Pipeline(
-                self._intake, processor, sinks
+                self._tap(self._intake), processor, sinks
             )
             self.health.queues = pipeline.stats
             try:
