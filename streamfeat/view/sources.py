@@ -12,6 +12,8 @@ from typing import Any
 
 from rich.console import Console
 
+from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
