@@ -1,5 +1,4 @@
-"""Make `tests/golden/`: models, a classifier, recordings and a live job's state, with the features they must
-give.
+"""Make `tests/golden/`: models, a classifier, recordings and a state, with the features they must give.
 
     python tests/make_golden.py tests/golden [--label TEXT]
 
