@@ -38,6 +38,11 @@ def test_names_decide_whatever_their_order(folder, order, names, separator, star
     np.testing.assert_array_equal(read(folder / "a.csv", scenes.text(SCENE, order, separator, header)), SCENE)
 
 
+def test_one_step_back_in_a_short_table_does_not_swap_its_columns(tmp_path):
+    events = read(tmp_path / "a.txt", b"20 1 2 1\n10 1 2 1\n")
+    assert [events[name].tolist() for name in "txyp"] == [[20, 10], [1, 1], [2, 2], [1, 1]]
+
+
 @pytest.mark.parametrize("order", ["txyp", "xytp", "xypt", "tpxy", "pxyt", "ptxy"])
 @pytest.mark.parametrize("separator", [" ", ",", "\t", ";"])
 def test_order_is_found_by_values_and_said(tmp_path, order, separator):
@@ -163,6 +168,12 @@ class TestHdf5:
             root["t_offset"] = 49_599_300_000
         events = read_events(tmp_path / "dsec.h5").events
         np.testing.assert_array_equal(events["t"], SCENE["t"] + 49_599_300_000)
+        with h5py.File(tmp_path / "halves.h5", "w") as root:
+            for name in "xyp":
+                root[f"events/{name}"] = SCENE[name].astype("<u4")
+            root["events/t"], root["t_offset"] = SCENE["t"] + 0.5, 49_599_300_000
+        with pytest.raises(InputError, match=r"event 0: t = 100\.5, but must be whole"):
+            read_events(tmp_path / "halves.h5")
         with h5py.File(tmp_path / "e2vid.h5", "w") as root:
             root["events/ts"], root["events/ps"] = SCENE["t"] / 1e6, SCENE["p"].astype(bool)
             root["events/xs"], root["events/ys"] = SCENE["x"], SCENE["y"]

@@ -95,7 +95,7 @@ class TestOthersRead:
         pandas = pytest.importorskip("pandas")
         convert_recording(source, tmp_path / "out.csv")
         table = pandas.read_csv(tmp_path / "out.csv")
-        self.check(table[name] for name in "txyp")
+        self.check(table[name] for name in ("t_us", "x", "y", "p"))
 
     def test_faery_the_csv(self, source, tmp_path):
         faery = pytest.importorskip("faery")
@@ -107,6 +107,16 @@ class TestOthersRead:
         )
         found = np.concatenate([*rows])
         self.check(found[name] for name in ("t", "x", "y", "on"))
+
+
+@pytest.mark.parametrize("ending", [".csv", ".npz"])
+def test_a_slow_stream_keeps_its_times(tmp_path, ending):
+    events = tiny.steady(0, 20_000_000, 100)  # whole times of five events a second: nanoseconds?
+    path = tiny.write_items(tmp_path / "in.mcap", [tiny.packet(events)])
+    convert_recording(path, tmp_path / f"out{ending}")
+    found, resolution = read(tmp_path / f"out{ending}")
+    np.testing.assert_array_equal(found, events)
+    assert ending == ".csv" or resolution == tiny.RESOLUTION
 
 
 class TestSelection:
@@ -233,7 +243,9 @@ def test_the_command(run, source, tmp_path):
     csv = run("convert", source, tmp_path / "out.csv", "--json")
     assert csv.status == 0
     back = run("convert", tmp_path / "out.csv", tmp_path / "back.mcap", "--resolution", "16x12")
-    assert "assumed:" in back.err
+    assert "assumed:" not in back.err
+    guessed = run("convert", tmp_path / "out.csv", tmp_path / "guessed.mcap")
+    assert "assumed:" in guessed.err
     np.testing.assert_array_equal(read(tmp_path / "back.mcap")[0], stream())
     refused = run("convert", source, tmp_path / "x.mcap", "--hold-out", "1/5")
     assert (refused.status, len(refused.err.splitlines())) == (2, 1)

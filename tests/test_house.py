@@ -30,7 +30,17 @@ ROOMS = {
     "report": {"errors", "files"},
     "classify": {"engine", "errors", "events", "files", "messages", "recordings", "work"},
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
-    "convert": {"camera_files", "denoise", "errors", "events", "files", "messages", "recordings", "work"},
+    "convert": {
+        "camera_files",
+        "classify",
+        "denoise",
+        "errors",
+        "events",
+        "files",
+        "messages",
+        "recordings",
+        "work",
+    },
     "stream": {
         "classify",
         "denoise",

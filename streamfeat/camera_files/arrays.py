@@ -1,7 +1,7 @@
 """NumPy files: `.npy` and `.npz`, with columns, structured arrays, or `(n, 4)` arrays.
 
 Lives here: opening them without pickles and within bounds, and finding the array that holds events.
-Not here: what columns mean (`columns`), and which file is one (`event_files`).
+Not here: what columns mean (`columns`), and recognising such a file (`event_files`).
 """
 
 import zipfile
@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.camera_files.columns import Rows, layout_of, named_fields
-from streamfeat.camera_files.source import Contents, Losses, TableOptions, chosen_stream, one_line
+from streamfeat.camera_files.source import (
+    TIME_UNITS,
+    Contents,
+    Losses,
+    TableOptions,
+    checked_resolution,
+    chosen_stream,
+    one_line,
+)
 from streamfeat.errors import InputError
 from streamfeat.events import Events
 
@@ -49,10 +57,13 @@ def open_numpy(path: Path, head: bytes, options: TableOptions) -> Contents:
     columns, names = tables[streams[chosen_stream(path, streams, options.stream)]]
     if any(column.dtype.kind not in "biuf" for column in columns):
         raise InputError(f"{path}: columns x, y, p, t must be numbers")
-    layout = layout_of(path, columns, names, options)
+    said_unit = str(others.pop("t_unit", ""))
+    size = others.pop("resolution", np.empty(0))
+    layout = layout_of(path, columns, names, options, unit=said_unit if said_unit in TIME_UNITS else "")
     t, x, y, p = (columns[i] for i in layout.order)
     return Contents(
         partial(_read, path, layout.unit, {"t": t, "x": x, "y": y, "p": p}),
+        checked_resolution(path, *size) if size.shape == (2,) else None,
         streams=streams if len(streams) > 1 else (),
         assumptions=layout.assumptions,
         labels=tuple(

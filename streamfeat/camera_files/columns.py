@@ -8,7 +8,8 @@ Nothing in a table of four numbers says what they mean, so three rules decide, a
 
 - order: without names, the six orders in which x stands before y are tried. Polarity is 0 and 1 or -1 and 1,
   pixels are whole, times hardly ever fall; of several that fit, the one with the fewest falls and then the
-  largest times. A table whose times fall at more than every eighth step is refused;
+  largest times. In fewer than 50 rows a single fall says nothing. A table whose times fall at more than every
+  eighth step is refused;
 - unit: times with fractions are seconds, whole ones microseconds, unless that makes fewer than 100 events a
   second, fewer than any camera gives: then the next smaller unit that does not. Times since 1970 show their
   unit by their size;
@@ -51,7 +52,7 @@ _NAME = re.compile(
     r"(?:event_|events?/)?([a-z]+?)(?:[ _]*[\[(]\s*([a-z\u00b5\u03bc]+)\s*[\])]|[ _]+([a-z\u00b5\u03bc]+))?"
 )
 _LEAST_RATE = 100  # events a second; of noise alone, a sensor of 128x128 pixels gives ten times as many
-_LEAST_ROWS = 50  # to know a rate
+_LEAST_ROWS = 50  # to know a rate, or an order by its falls
 _LARGEST = {"x": 0xFFFF, "y": 0x7FFF, "p": 1, "t": (1 << 31) * 1_000_000 - 1}
 
 
@@ -169,7 +170,8 @@ def _fitting_order(table: Sequence[NDArray[Any]]) -> str | None:
         falls = _falls(t)
         if _are_many(falls, len(t)):
             continue
-        key = (falls, -float(t.max(initial=0)), rank)
+        said = falls if falls > 1 or len(t) >= _LEAST_ROWS else 0
+        key = (said, -float(t.max(initial=0)), rank)
         if best is None or key < best[0]:
             best = key, order
     return best[1] if best else None
@@ -247,7 +249,8 @@ class Rows:
             InputError: a value is none that an event can have.
         """
         t = _microseconds(columns["t"], self._unit)
-        values = {"t": t.astype(np.int64) + self._offset_us if self._offset_us else t}
+        # Fractions stay, to be refused below, and whole numbers whole.
+        values = {"t": (t.astype(np.int64) if t.dtype.kind in "iu" else t) + self._offset_us}
         for name in "xyp":
             values[name] = columns[name]
         for name, column in values.items():

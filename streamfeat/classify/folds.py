@@ -8,7 +8,6 @@ Samples that were cut from one video are near copies of their neighbours: on N-C
 accuracy on the official test set. So folds are blocks of neighbours unless something else is asked for.
 """
 
-import re
 from collections.abc import Sequence
 from typing import Literal, cast, get_args
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
+from streamfeat.files.locations import natural_order
 
 __all__ = ["Groups", "assign_folds", "block_numbers", "bootstrap_units", "check_labels", "groups_named"]
 
@@ -53,16 +53,9 @@ def block_numbers(labels: Sequence[str], sources: Sequence[str], n: int) -> NDAr
     for i, label in enumerate(labels):
         members.setdefault(label, []).append(i)
     for mine in members.values():
-        mine.sort(key=lambda i: _natural(sources[i]))
+        mine.sort(key=lambda i: natural_order(sources[i]))
         blocks[mine] = np.arange(len(mine)) * n // len(mine)
     return blocks
-
-
-def _natural(text: str) -> tuple[tuple[int, str], ...]:
-    """Sorts as people do: 9 before 10."""
-    return tuple(
-        (int(part), "") if i % 2 else (-1, part) for i, part in enumerate(re.split(r"(\d{1,18})", text))
-    )
 
 
 def check_labels(labels: Sequence[str]) -> None:

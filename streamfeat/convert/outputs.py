@@ -163,13 +163,13 @@ class Evt3Output(_OneSensor):
 
 
 class CsvOutput(_OneSensor):
-    """Text: a line of names, then `t,x,y,p` in microseconds."""
+    """Text: the names `t_us,x,y,p`, then a line for each event."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         """Write the names."""
         super().__init__(path)
         self._file = file
-        file.write(b"t,x,y,p\n")
+        file.write(b"t_us,x,y,p\n")
 
     def add(self, events: Events) -> None:
         """See `_OneSensor.add`."""
@@ -178,7 +178,7 @@ class CsvOutput(_OneSensor):
 
 
 class NpzOutput(_OneSensor):
-    """NumPy: members `x`, `y`, `p`, `t` (microseconds) and `resolution` (height, width), compressed."""
+    """NumPy, compressed: members `x`, `y`, `p`, `t`, `t_unit` ("us") and `resolution` (height, width)."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         """Columns wait in temporary files, because a member says first how long it is."""
@@ -208,8 +208,10 @@ class NpzOutput(_OneSensor):
                     np.lib.format.write_array_header_1_0(member, header)
                     while block := column.read(1 << 20):
                         member.write(block)
-            with members.open("resolution.npy", "w") as member:
-                np.lib.format.write_array(member, np.array(self.resolution or (0, 0)))
+            about = {"resolution": np.array(self.resolution or (0, 0)), "t_unit": np.array("us")}
+            for name, array in about.items():
+                with members.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, array)
 
 
 class Hdf5Output(_OneSensor):

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from streamfeat.classify.folds import block_numbers
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 
@@ -61,16 +62,11 @@ def hold_out_block(samples: Sequence[SamplePath], block: int, n: int) -> list[Sa
     neighbours. In data that were cut from video neighbours are near copies of each other, and a sample held
     out from between them would be none. Samples of a test folder stay, and are not counted.
     """
-    classes = defaultdict(list)
-    for i, sample in enumerate(samples):
-        if sample.split != "test":
-            classes[sample.label].append(i)
+    cut = [i for i, sample in enumerate(samples) if sample.split != "test"]
+    blocks = block_numbers([samples[i].label for i in cut], [samples[i].source for i in cut], n)
     marked = list(samples)
-    for members in classes.values():
-        members.sort(key=lambda i: _natural(samples[i].source))
-        for rank, i in enumerate(members):
-            held_out = rank * n // len(members) == block - 1
-            marked[i] = replace(samples[i], split="validation" if held_out else "train")
+    for i, number in zip(cut, blocks, strict=True):
+        marked[i] = replace(samples[i], split="validation" if number == block - 1 else "train")
     return marked
 
 
@@ -94,9 +90,3 @@ def spread(samples: Sequence[SamplePath], limit: int) -> list[SamplePath]:
     listed = list(groups.values())
     taken = [listed[i][turn] for turn, i in order[:limit]]
     return sorted(taken, key=lambda sample: sample.source)
-
-
-def _natural(source: str) -> list[tuple[int, str]]:
-    """Sorts as people do: 9 before 10."""
-    parts = re.split(r"(\d{1,18})", source)
-    return [(int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)]

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from streamfeat.errors import InputError
-from streamfeat.files.locations import Location, StoreLocation, files_below, open_binary
+from streamfeat.files.locations import Location, StoreLocation, files_below, natural_order, open_binary
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.sources import WHOLE, Part, Source, SourceItem, StoredMessage, Topic
 
@@ -98,7 +98,7 @@ def bag_members(folder: Location) -> tuple[list[Location], Metadata, list[str]]:
         said.append(f"{_METADATA} names {_some(missing)}, which the folder does not hold")
     if left_out := sorted(set(files) - set(chosen)):
         said.append(f"{_some(left_out)} left out: {_METADATA} does not name them")
-    return [chosen[name] for name in sorted(chosen, key=_natural)], metadata, said
+    return [chosen[name] for name in sorted(chosen, key=natural_order)], metadata, said
 
 
 class FilesSource:
@@ -229,11 +229,6 @@ def _files_in(folder: Location) -> list[Location]:
         return [path for path in folder.iterdir() if path.is_file()]
     except OSError as error:
         raise InputError(f"{folder}: cannot be listed: {error.strerror}") from None
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts as people do: 9 before 10."""
-    return [(int(p), "") if i % 2 else (-1, p) for i, p in enumerate(re.split(r"(\d{1,18})", name))]
 
 
 def _some(names: Sequence[str]) -> str:
