@@ -1,6 +1,6 @@
 """Measure streamfeat on this machine; write `results.json`, two pictures and the tables of the page.
 
-    python tools/bench --recording ncars.mcap            # everything, about ten minutes
+    python tools/bench --recording ncars.mcap            # everything; takes long
     python tools/bench --only floors,ingest              # these parts; others stay as they were
     python tools/bench --quick --json /tmp/quick.json    # does everything run? (figures mean nothing)
     python tools/bench --readme                          # tables from results.json, nothing is measured
