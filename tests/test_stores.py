@@ -210,10 +210,10 @@ def test_a_server_that_stops_midway_does_not_end_the_recording(store, small_bloc
 
 def test_a_conversion_that_a_store_leaves_writes_nothing(store, refuse, tmp_path):
     folder = tmp_path / "half_train"
-    for i in range(4):
+    for i in range(20):  # more than are fetched ahead
         put(folder / "1" / f"{i}.bin", bin40_bytes(sample_events(i, width=20)))
     url = store.put(folder)
-    with pytest.raises(InputError, match=rf"^{url}/1/[23].bin: .*the store refuses"):
+    with pytest.raises(InputError, match=rf"^{url}/1/\d+.bin: .*the store refuses"):
         convert(url, tmp_path / "out.mcap", progress=lambda n, total: n == 2 and refuse())
     assert not (tmp_path / "out.mcap").exists()
 

@@ -280,15 +280,16 @@ def test_a_replay_ends_on_sigterm_as_on_ctrl_c(home, tmp_path):
     assert list(tmp_path.iterdir()) == [target]
 
 
-WORDS = ["--patch", 4, "--stride", 4, "--bins", 2, "--filters", 7, "--window-ms", 100, "--volumes", 200]
+LONG = ["--patch", 8, "--filters", 200, "--volumes", 8000, "--lambda0", 0.1, "--iterations", 10**9]
+"""More than a hundred iterations of a fifth of a second, with the digits that ship."""
 
 
 @pytest.mark.parametrize("command", ["learn", "convert"])
 def test_sigterm_ends_a_command_as_ctrl_c_does(command, home, tmp_path):
-    """While it is at work: it would take hours, or long enough."""
+    """While it is at work, which would take much longer."""
     target = tmp_path / "out"
     if command == "learn":
-        words = [home / "few.mcap", "-o", target, *WORDS, "--formulation", "inverse", "--iterations", 10**9]
+        words = [ROOT / "recordings/digits_train.mcap", "-o", target, *LONG, "--formulation", "inverse"]
     else:
         for i in range(300):
             (home / f"data/Train/{i % 2}").mkdir(parents=True, exist_ok=True)
