@@ -16,9 +16,10 @@ from streamfeat.errors import InputError
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.replay import ReplayJob
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, TerminalSink
 
 MODEL = tiny.encoder(k=3)

@@ -35,8 +35,9 @@ from streamfeat.messages.packets import Packet
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline, Processor
 from streamfeat.stream.session import Session, StreamItem
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
 from streamfeat.stream.table import TableSink
 

@@ -21,7 +21,8 @@ from streamfeat.live.publisher import CameraSink
 from streamfeat.messages.cdr import EventPacket, LabelMessage
 from streamfeat.messages.packets import Label, Packet, PacketWriter
 from streamfeat.recordings.reader import open_recording
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import open_sinks
 
 __all__ = ["PublishJob"]

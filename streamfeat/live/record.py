@@ -25,7 +25,8 @@ from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.delivery import Delivery, DeliveryStats
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import open_sinks
 
 __all__ = ["RecordJob"]

@@ -22,8 +22,9 @@ from streamfeat.recordings.reader import Label, Packet, Recording, open_recordin
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
 from streamfeat.stream.table import TableSink
 

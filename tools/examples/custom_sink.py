@@ -14,8 +14,9 @@ from pathlib import Path
 
 import streamfeat as sf
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
