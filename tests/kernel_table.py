@@ -19,6 +19,7 @@ from streamfeat.kernels import (
     change,
     code,
     decode,
+    denoise,
     encode,
     follow,
     ingest,
@@ -29,6 +30,7 @@ from streamfeat.kernels import (
     volume,
 )
 from streamfeat.kernels.layout import (
+    BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
@@ -870,6 +872,21 @@ def close_surfaces(kernel: Run, twin: Run) -> None:
         np.testing.assert_allclose(mine, yours, rtol=1e-6)
 
 
+def make_mark_noise(rng):
+    height, width, n = int(rng.integers(1, 6)), int(rng.integers(1, 6)), int(rng.integers(0, 200))
+    events = np.zeros(n, EVENT_DTYPE)
+    events["x"], events["y"] = rng.integers(0, width + 1, n), rng.integers(0, height + 1, n)
+    events["p"] = rng.choice([0, 1, 0, 1, 0, 1, -1, 2], n)
+    steps = rng.choice([0, 1, 20, 300, -40, 5_000, 2_000_000, -2_000_000], n, p=[0.2] * 4 + [0.05] * 4)
+    events["t"] = np.cumsum(steps)
+    if n:
+        events["t"][rng.integers(0, n)] = rng.choice([1 << 62, -(1 << 62), (1 << 62) - 1, 1 - (1 << 62), 5])
+    limits = np.array([rng.choice([0, 1, 90_000, 600_000]), *rng.choice([0, 1, 30, 1_000], 2)], np.int64)
+    past = np.where(rng.random((3, height, width)) < 0.5, BEFORE_TIME, rng.integers(-500, 500))
+    level = rng.integers(0, 2 * denoise.HOT_LEVEL, (height, width))
+    return events, limits, past.astype(np.int64), level, rng.integers(0, 9, 3), np.zeros(n, np.bool_)
+
+
 @dataclass(frozen=True)
 class Row:
     """A kernel, a maker of random arguments, and the meaning of "the same result"."""
@@ -900,6 +917,7 @@ KERNELS = [
     Row(code.gain, make_gain),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
+    Row(denoise.mark_noise, make_mark_noise),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),
     Row(ingest.start_of_bin, make_start_of_bin),

@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -22,14 +23,25 @@ ROOMS = {
     "work": {"errors"},
     "engine": {"errors", "events", "files", "kernels"},
     "messages": {"errors", "events", "files", "kernels"},
+    "denoise": {"errors", "events", "kernels", "messages"},
     "simulate": {"events"},
     "camera_files": {"errors", "events", "files", "messages"},
-    "recordings": {"camera_files", "errors", "events", "files", "messages"},
+    "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages"},
     "report": {"errors", "files"},
     "classify": {"engine", "errors", "events", "files", "messages", "recordings", "work"},
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
-    "convert": {"camera_files", "errors", "events", "files", "messages", "recordings", "work"},
-    "stream": {"classify", "engine", "errors", "events", "files", "kernels", "messages", "recordings"},
+    "convert": {"camera_files", "denoise", "errors", "events", "files", "messages", "recordings", "work"},
+    "stream": {
+        "classify",
+        "denoise",
+        "engine",
+        "errors",
+        "events",
+        "files",
+        "kernels",
+        "messages",
+        "recordings",
+    },
     "evaluate": ALL_ABOVE,
     "latency": ALL_ABOVE,
     "live": ALL_ABOVE,
@@ -40,7 +52,7 @@ ROOMS = {
 """Each room, and the rooms above it that it may import from."""
 
 ONLY_IN = {
-    "asyncio": {"stream", "latency"},
+    "asyncio": {"stream", "latency", "view"},
     "mcap": {"recordings"},
     "zenoh": {"live"},
     "prometheus_client": {"live"},
@@ -53,6 +65,7 @@ ONLY_IN = {
     "dask": {"work"},
     "distributed": {"work"},
     "foxglove": {"view"},
+    "websockets": {"view"},
     "numba": {"kernels", "latency", "cli"},
 }
 """The rooms that may import a library."""
@@ -229,3 +242,39 @@ def test_what_a_module_offers_exists_and_is_described(name):
 
 def test_the_package_offers_about_a_dozen_names():
     assert len(streamfeat.__all__) <= 16
+
+
+PAGES = [
+    page
+    for folder in (".", "recordings", "streamfeat", "tests", "tools")
+    for page in PACKAGE.parent.glob(f"{folder}/**/*.md" if folder != "." else "*.md")
+]
+
+
+def test_links_of_pages_lead_to_files_and_headings():
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for link in re.findall(r"\]\(\s*([^)\s]+)\s*\)", text):
+            if link.startswith(("http:", "https:")):
+                continue
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            assert target.exists(), f"{page}: {link}"
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                anchors = {re.sub(r"[^a-z0-9 _-]", "", h.lower()).replace(" ", "-") for h in headings}
+                assert anchor in anchors, f"{page}: {link}"
+
+
+def test_the_front_page_is_short():
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 300
+    assert len(text.encode()) <= 20_000
+
+
+def test_tests_import_no_tools():
+    for path in (PACKAGE.parent / "tests").rglob("*.py"):
+        for node in ast.walk(tree_of(path)):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not any(name.split(".")[0] == "tools" for name in modules), path

@@ -52,7 +52,7 @@ RULES = """{
     ],
   },
 }"""
-"""The example of the README."""
+"""The example of `streamfeat/live/README.md`."""
 
 
 class Authority:

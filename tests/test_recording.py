@@ -106,9 +106,9 @@ def test_round_trip(tmp_path, encoding, compression):
     assert all(np.ptp(item.events["t"]) < 1_000_000 for item in items[1:])
 
 
-def test_disorder_and_jumps_back_are_kept(tmp_path):
+def test_packets_come_in_order_of_log_time_and_keep_the_disorder_inside(tmp_path):
     events = make_events([1, 2, 3, 4], 0, 1, [5_000_000, 4_999_000, 12, 9_000_000])
-    np.testing.assert_array_equal(read(write(tmp_path / "a.mcap", events))[0], events)
+    np.testing.assert_array_equal(read(write(tmp_path / "a.mcap", events))[0], events[[2, 0, 1, 3]])
 
 
 def test_others_read_all_that_we_write(tmp_path):
@@ -313,7 +313,7 @@ def test_no_recording(tmp_path, content, reason):
     ],
 )
 def test_bad_packets_are_counted_and_only_bad_packets_are_an_error(tmp_path, message, reason):
-    path = write_messages(tmp_path / "a.mcap", packet(), message, packet())
+    path = write_messages(tmp_path / "a.mcap", packet(), message, packet(seq=2))
     events, losses = read(path)
     assert len(events) == 2
     assert (dict(losses.counts), dict(losses.bytes)) == ({"bad packet": 1}, {"bad packet": len(message)})
@@ -335,13 +335,15 @@ def test_bad_label_is_counted(tmp_path):
 
 def test_topics(tmp_path):
     path = write_messages(tmp_path / "a.mcap", packet(), topic=["/left", "/right"])
-    with pytest.raises(InputError, match=r"choose one of \['/left', '/right'\]"):
+    with pytest.raises(InputError, match=r"/left, /right; choose one with --topic"):
         open_recording(path)
     with open_recording(path, "/right") as recording:
         assert (recording.topic, recording.n_events) == ("/right", 1)
-    with pytest.raises(InputError, match="no events on topic '/up'"):
+    with pytest.raises(InputError, match="no events on topic /up; --topic can be /left, /right"):
         open_recording(path, "/up")
-    with pytest.raises(InputError, match=r"no topic carries event_camera_msgs"):
+    with pytest.raises(
+        InputError, match=r"no topic carries events; there are /events \(std_msgs/msg/String\)"
+    ):
         open_recording(write_messages(tmp_path / "b.mcap", packet(), schema="std_msgs/msg/String"))
     with pytest.raises(InputError, match="it has no messages"):
         open_recording(write_messages(tmp_path / "c.mcap"))
@@ -519,7 +521,7 @@ def test_summary_with_a_wrong_crc_is_not_believed(tmp_path):
 def test_chunk_that_grows_without_end(tmp_path, compression):
     path = tmp_path / "a.mcap"
     bomb = packet(payload=bytes(64 << 20))
-    write_messages(path, packet(), bomb, packet(), compression=compression, chunk_size=1)
+    write_messages(path, packet(), bomb, packet(seq=2), compression=compression, chunk_size=1)
     claimed = struct.pack("<Q", len(bomb) + 31)
     path.write_bytes(path.read_bytes().replace(claimed, struct.pack("<Q", 1000), 1))
     tracemalloc.start()
@@ -536,7 +538,7 @@ def test_chunk_that_grows_without_end(tmp_path, compression):
 
 def test_claims_beyond_the_limit(tmp_path, monkeypatch):
     path = write_messages(
-        tmp_path / "a.mcap", packet(), packet(payload=bytes(80_000)), packet(), chunk_size=1
+        tmp_path / "a.mcap", packet(), packet(payload=bytes(80_000), seq=1), packet(seq=2), chunk_size=1
     )
     monkeypatch.setattr(mcap_records, "MAX_RECORD_BYTES", 50_000)
     events, losses = read(path)
@@ -548,7 +550,9 @@ def test_long_recording_takes_little_memory(tmp_path):
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, compression="none") as writer:
         for i in range(30):
-            writer.write_events(random_events(50_000, 900_000, seed=i), RESOLUTION)
+            events = random_events(50_000, 900_000, seed=i)
+            events["t"] += i * 1_000_000
+            writer.write_events(events, RESOLUTION)
     assert path.stat().st_size > 11 << 20
     tracemalloc.start()
     with open_recording(path) as recording:

@@ -261,7 +261,7 @@ def test_a_pass_fetches_each_byte_once_and_keeps_few(web, small_blocks):
         before = Web.served
         list(recording)
         assert Web.served - before <= len(DATA)
-        assert recording._file._file.cache.cache_info().currsize == 4
+        assert recording._source._file._file.cache.cache_info().currsize == 4
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,8 @@ def test_a_client_gets_what_is_shown(board):
     assert channels["/view/events"]["schemaName"] == "foxglove.RawImage"
     assert channels["/view/status"]["metadata"] == ABOUT
     assert set(channels) == {
-        f"/view/{name}" for name in ("events", "bins", "volumes", "features", "prediction", "status")
+        f"/view/{name}"
+        for name in ("events", "bins", "volumes", "features", "prediction", "engine", "status")
     }
 
 

@@ -1,4 +1,4 @@
-"""The README's table of what happens when: each row has its tests, here or elsewhere."""
+"""The table of what happens when (`streamfeat/cli/README.md`): each row has its tests."""
 
 import ast
 import asyncio
@@ -102,9 +102,9 @@ ROWS = {
 
 
 def table():
-    """First cells of the README's table."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("## What happens when") : text.index("## Live\n")]
+    """First cells of the table."""
+    text = (ROOT / "streamfeat" / "cli" / "README.md").read_text(encoding="utf-8")
+    section = text[text.index("## What happens when") : text.index("## Security\n")]
     rows = re.findall(r"^\| (.*?) \|", section, re.MULTILINE)
     assert rows[0] == "when"
     return rows[1:]

@@ -11,9 +11,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from browser import PATIENCE_S, Browser
-
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "tests"))
+
+from browser import PATIENCE_S, Browser  # noqa: E402
+
 PICTURE = ROOT / "tools" / "view.png"
 STAND_STILL = """
   const hear = listener.onMessage;

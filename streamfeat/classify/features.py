@@ -83,11 +83,13 @@ class EncodedSamples:
     Attributes:
         rows: `(n, F)` float32.
         labels: `(n,)` names.
+        sources: `(n,)` texts, what the labels say that samples are from.
         held_out: `(n,)` bool, whether a sample is of a held-out split.
     """
 
     rows: NDArray[np.float32]
     labels: NDArray[np.str_]
+    sources: NDArray[np.str_]
     held_out: NDArray[np.bool_]
 
 
@@ -123,6 +125,7 @@ def encode_recordings(
     return EncodedSamples(
         np.concatenate(rows) if rows else np.empty((0, encoder.n_features), np.float32),
         np.array([label.label for label in labels], str),
+        np.array([label.source for label in labels], str),
         np.array([label.split in HELD_OUT_SPLITS for label in labels], bool),
     )
 

@@ -34,7 +34,7 @@ EXTRAS = {
     "store": "recordings by URL",
     "view": "Foxglove",
     "bench": "peers in tools/bench",
-    "fuzz": "guided inputs in tools/torture",
+    "fuzz": "guided inputs in tests/torture",
     "test": "the tests",
     "lint": "lint and types",
 }

@@ -18,6 +18,7 @@ from streamfeat.cli.program import (
     ModelOption,
     OverwriteOption,
     QuietOption,
+    TopicOption,
     VerboseOption,
     WorkersOption,
     app,
@@ -29,11 +30,20 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
+from streamfeat.cli.reading import (
+    HotPixels,
+    Isolated,
+    Refractory,
+    denoising_of,
+    print_assumptions,
+    reads_recordings,
+)
 from streamfeat.errors import InputError
 from streamfeat.files.locations import location_of
 
 if TYPE_CHECKING:
     from streamfeat.live.names import Names
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["listen", "publish", "record", "recover", "topics"]
 
@@ -90,6 +100,9 @@ def listen(
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from labels published beside the events.")
     ] = False,
+    hot_pixels: HotPixels = None,
+    refractory: Refractory = None,
+    isolated: Isolated = None,
     ros2: RosOption = None,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
@@ -136,6 +149,7 @@ def listen(
     common: dict[str, Any] = {
         "emit": emit,
         "learn_online": learn_online,
+        "denoising": denoising_of(hot_pixels, refractory, isolated) or None,
         "reliable": reliable,
         "zenoh_config": zenoh_config,
         "port": port,
@@ -193,11 +207,14 @@ def _spread(
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
+@reads_recordings()
 def publish(
     sources: Annotated[
         list[str],
         typer.Argument(metavar="REC KEY...", help="Recordings, each followed by the key it is published on."),
     ],
+    reading: "ReadOptions",
+    topic: TopicOption = None,
     speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
     encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
@@ -223,6 +240,8 @@ def publish(
     job = PublishJob(
         pairs,
         names,
+        topic=topic,
+        reading=reading,
         speed=parse_speed(speed),
         loop=loop,
         encoding=encoding,
@@ -231,6 +250,7 @@ def publish(
         zenoh_config=zenoh_config,
         port=port,
     )
+    print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
         job.run(report)
     print_result(job.result(), "published", as_json=as_json)

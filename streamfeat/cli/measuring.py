@@ -29,9 +29,11 @@ from streamfeat.cli.program import (
     progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
 
 if TYPE_CHECKING:
     from streamfeat.latency.measure import LatencyReport
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["latency"]
 
@@ -42,8 +44,10 @@ _NOTABLE_STEAL = 0.05
     epilog="Example: streamfeat latency recordings/digits_test.mcap -m recordings/digits.safetensors "
     "--plot latency.html"
 )
+@reads_recordings()
 def latency(
     recording: RecordingArgument,
+    reading: "ReadOptions",
     models: Annotated[
         list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
     ],
@@ -83,6 +87,7 @@ def latency(
         models,
         emit,
         topic=topic,
+        reading=reading,
         split=split,
         warm_up=warm_up,
         limit_events=limit_events,
@@ -90,6 +95,7 @@ def latency(
         speed=speed,
         look_ahead=look_ahead,
     )
+    print_assumptions(report.assumptions)
     try:
         with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")

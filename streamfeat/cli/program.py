@@ -95,13 +95,16 @@ else:
     AnyLocation = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
 RecordingArgument = Annotated[
     AnyLocation,
-    typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=location_of),
+    typer.Argument(metavar="REC", help="Recording: MCAP, bag, camera file; or its URL.", parser=location_of),
 ]
 RecordingsArgument = Annotated[
     list[AnyLocation],
-    typer.Argument(metavar="REC...", help="MCAP recordings of events, or their URLs.", parser=location_of),
+    typer.Argument(metavar="REC...", help="Recordings, or their URLs.", parser=location_of),
 ]
-TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
+TopicOption = Annotated[
+    str | None,
+    typer.Option("--topic", "--stream", help="Event topic or stream, where a recording has several."),
+]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]

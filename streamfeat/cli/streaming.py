@@ -6,7 +6,7 @@ Not here: the job (`replay`).
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,6 +25,10 @@ from streamfeat.cli.program import (
     progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
+
+if TYPE_CHECKING:
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["replay"]
 
@@ -33,9 +37,11 @@ __all__ = ["replay"]
     epilog="Example: streamfeat replay recordings/digits_test.mcap -m recordings/digits.safetensors "
     "-c recordings/digits_classifier.safetensors"
 )
+@reads_recordings()
 def replay(
     recording: RecordingArgument,
     model: ModelOption,
+    reading: "ReadOptions",
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
@@ -76,9 +82,11 @@ def replay(
         emit=emit,
         speed=speed,
         topic=topic,
+        reading=reading,
         split=split,
         learn_online=learn_online,
     )
+    print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"
     with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
         job.run(

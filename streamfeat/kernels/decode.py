@@ -13,8 +13,8 @@ from streamfeat.kernels.compiled import kernel
 
 __all__ = ["decode_evt3", "decode_libcaer_cmp"]
 
-# A TIME_HIGH that goes back by at most this many steps is a late word; by more, a wrap of its 12 bits.
-TIME_HIGH_BACKSTEP = 10
+# A TIME_HIGH that goes back by less than half of its 12 bits is late or has a flipped bit; by more, a wrap.
+TIME_HIGH_BACKSTEP = 0x7FF
 
 
 @kernel

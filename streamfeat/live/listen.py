@@ -6,7 +6,7 @@ Not here: each of the parts.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,8 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.live import Live
 
-from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
+from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
@@ -59,6 +60,7 @@ class ListenJob:
         classifier: to predict with; none for features alone.
         emit: when to read, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
+        denoising: noise of each camera that is taken out before anything is counted.
         reliable: recover missed packets and ask for history, from publishers that do the same.
         zenoh_config: JSON5 file; without it, this machine alone.
         port: where sessions on this machine meet.
@@ -74,6 +76,7 @@ class ListenJob:
             of one who goes on with the cameras of another.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
+        tap: what items pass through before anything is computed from them.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -87,6 +90,7 @@ class ListenJob:
         *,
         emit: str = "auto",
         learn_online: bool = False,
+        denoising: Denoising | None = None,
         reliable: bool = False,
         zenoh_config: Path | None = None,
         port: int = DEFAULT_PORT,
@@ -101,21 +105,25 @@ class ListenJob:
         joins_late: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
+        tap: Callable[[Iterable[Any]], Iterable[Any]] = lambda items: items,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = EmitPolicy.parse(emit)
         self._encoder = Encoder.load(model)
-        self._classifier = Classifier.load(classifier) if classifier else None
+        self._classifier = load_classifier(classifier) if classifier else None
         if self._classifier:
             self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
         elif learn_online:
             raise InputError("--learn-online needs a classifier to start from; give one with -c")
         if state and learn_online:
             raise InputError("--state does not keep what --learn-online learns; give one of the two")
+        if state and denoising:
+            raise InputError("--state does not keep what is known of noisy pixels; give one of the two")
+        self._denoising = denoising
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._reliable = learn_online, reliable
-        self._engine_of = engine_of
+        self._engine_of, self._tap = engine_of, tap
         self._zenoh_config, self._port = zenoh_config, port
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
@@ -187,7 +195,7 @@ class ListenJob:
                 sinks[-1] if isinstance(sinks[-1], Checkpointer) else self.health
             )
             pipeline: Pipeline[StreamItem | CameraLeft | Barrier, Emission] = Pipeline(
-                self._intake, processor, sinks
+                self._tap(self._intake), processor, sinks
             )
             self.health.queues = pipeline.stats
             try:
@@ -249,6 +257,7 @@ class ListenJob:
             topic=topic,
             is_behind=is_behind or self._is_behind,
             engine=engine or self._engine_of(topic),
+            denoising=self._denoising,
         )
 
     def _keeper(self) -> Checkpointer:

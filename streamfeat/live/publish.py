@@ -20,6 +20,7 @@ from streamfeat.live.network import DEFAULT_PORT, open_session
 from streamfeat.live.publisher import CameraSink
 from streamfeat.messages.cdr import EventPacket, LabelMessage
 from streamfeat.messages.packets import Label, Packet, PacketWriter
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import open_recording
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.signals import run_until_interrupted
@@ -36,6 +37,8 @@ class PublishJob:
     Args:
         sources: recordings, with the topic of each.
         names: how topics are called.
+        topic: event topic of the recordings, where they have several.
+        reading: how to read the recordings.
         speed: stream seconds for each second of the clock; None for as fast as readers take it.
         loop: start again at the end, with times that go on.
         encoding: of the payloads.
@@ -53,6 +56,8 @@ class PublishJob:
         sources: list[tuple[Location, str]],
         names: Names,
         *,
+        topic: str | None = None,
+        reading: ReadOptions = AS_IT_IS,
         speed: float | None = 1.0,
         loop: bool = False,
         encoding: str = "mono",
@@ -65,10 +70,13 @@ class PublishJob:
         topics = [topic for _, topic in sources]
         if len(set(topics)) < len(topics) or any("*" in topic for topic in topics):
             raise InputError(f"each recording needs a topic of its own, without wildcards, not {topics}")
+        self.assumptions: list[str] = []
         for path, _ in sources:
-            open_recording(path).close()
+            with open_recording(path, topic, reading) as recording:
+                self.assumptions += recording.assumptions
         PacketWriter(encoding)
         self._sources, self._names = sources, names
+        self._topic, self._reading = topic, reading
         self._speed, self._loop, self._encoding = speed, loop, encoding
         self._reliable, self._wait_s = reliable, wait_s
         self._zenoh_config, self._port = zenoh_config, port
@@ -96,7 +104,7 @@ class PublishJob:
             pipelines: list[Pipeline[Packet | Label, EventPacket | LabelMessage]] = []
             for (path, topic), cutter, sink in zip(self._sources, self._cutters, self._sinks, strict=True):
                 _wait_for_readers(session, self._names.key(topic, EventPacket.SCHEMA_NAME), self._wait_s)
-                items = recordings.enter_context(open_recording(path)).played(
+                items = recordings.enter_context(open_recording(path, self._topic, self._reading)).played(
                     loop=self._loop,
                     report=lambda n, total, topic=topic: report(f"publishing {topic}", n, total, ""),  # type: ignore[misc]
                 )
@@ -124,10 +132,14 @@ class _Cutter:
 
     def __init__(self, encoding: str) -> None:
         self._writer = PacketWriter(encoding)
+        self._epoch = 0
         self.events = 0
 
     def process(self, item: Packet | Label) -> Iterator[EventPacket | LabelMessage]:
         if isinstance(item, Packet):
+            if item.epoch != self._epoch:
+                self._epoch = item.epoch
+                self._writer.restart()
             yield from self._writer.messages(item.events, item.resolution)
             self.events += len(item.events)
         else:

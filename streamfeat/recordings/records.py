@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -32,6 +32,7 @@ from streamfeat.files.locations import Location, open_binary
 
 __all__ = [
     "MAX_RECORD_BYTES",
+    "Block",
     "Losses",
     "Summary",
     "count_missing",
@@ -56,6 +57,8 @@ _CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
 
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+
 _NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 Record = Schema | Channel | Message
@@ -69,6 +72,7 @@ class Losses:
     bytes: Counter[str] = field(default_factory=Counter)
     first: dict[str, str] = field(default_factory=dict)
     """For each reason, where it struck first and why."""
+    removed: Counter[str] = field(default_factory=Counter)  # as noise, on request: no losses
 
     def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
         """Count one loss."""
@@ -79,13 +83,20 @@ class Losses:
 
     def add_all(self, others: "Losses") -> None:
         """Count the losses of another part of the same recording."""
-        self.counts += others.counts
-        self.bytes += others.bytes
-        self.first = others.first | self.first
+        self.counts, self.bytes = self.counts + others.counts, self.bytes + others.bytes
+        self.first, self.removed = others.first | self.first, self.removed + others.removed
 
     def __bool__(self) -> bool:
         """Whether anything was lost."""
         return bool(self.counts)
+
+
+class Block(NamedTuple):
+    """A chunk of a file: its byte, and the earliest and latest log time in it, nanoseconds since 1970."""
+
+    at: int
+    first_ns: int
+    last_ns: int
 
 
 @dataclass(slots=True)
@@ -96,8 +107,7 @@ class Summary:
     channels: dict[int, Channel] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages of each channel id."""
-    chunk_starts: list[int] = field(default_factory=list)
-    """The byte where each chunk starts."""
+    blocks: list[Block] = field(default_factory=list)  # not sorted
 
 
 def open_mcap(place: Location) -> BinaryIO:
@@ -123,7 +133,12 @@ def open_mcap(place: Location) -> BinaryIO:
 
 
 def iter_messages(
-    file: BinaryIO, known: Summary | None, losses: Losses, start: int = 0, end: float = math.inf
+    file: BinaryIO,
+    known: Summary | None,
+    losses: Losses,
+    start: int = 0,
+    end: float = math.inf,
+    stop: float = math.inf,
 ) -> Iterator[tuple[int, Channel, Schema, Message]]:
     """Yield messages in file order, each with its byte (see `iter_records`), channel and schema.
 
@@ -131,12 +146,11 @@ def iter_messages(
         file: opened by `open_mcap`.
         known: what the summary said; its channels stand in for those lost in a damaged chunk.
         losses: changed.
-        start: see `iter_records`.
-        end: see `iter_records`.
+        start, end, stop: see `iter_records`.
     """
     schemas = {0: _NO_SCHEMA} | (known.schemas if known else {})
     channels = dict(known.channels if known else {})
-    for at, record in iter_records(file, losses, start, end):
+    for at, record in iter_records(file, losses, start, end, stop):
         if at >= end:
             losses = Losses()
         if isinstance(record, Channel):
@@ -154,7 +168,7 @@ def iter_messages(
 
 
 def iter_records(
-    file: BinaryIO, losses: Losses, start: int = 0, end: float = math.inf
+    file: BinaryIO, losses: Losses, start: int = 0, end: float = math.inf, stop: float = math.inf
 ) -> Iterator[tuple[int, Record]]:
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
@@ -167,12 +181,15 @@ def iter_records(
         losses: changed.
         start: the byte of a chunk to begin with; 0 for the first record.
         end: from this byte on losses are not counted, for somebody else does.
+        stop: end at this byte.
     """
     size = file.seek(0, os.SEEK_END)
     at = trusted = max(start, len(_MAGIC))  # up to `trusted`, records start where we think they do
     while True:
         if at >= end:
             losses = Losses()
+        if at >= stop:
+            return
         file.seek(at)
         head = file.read(_CHUNK_HEAD_BYTES)
         if len(head) < _FRAME.size:
@@ -253,22 +270,26 @@ def _parse_summary(section: bytes) -> Summary | None:
             elif opcode == Opcode.STATISTICS:
                 summary.message_counts = Statistics.read(body).channel_message_counts
             elif opcode == Opcode.CHUNK_INDEX:
-                summary.chunk_starts.append(ChunkIndex.read(body).chunk_start_offset)
+                index = ChunkIndex.read(body)
+                times = index.message_start_time, index.message_end_time
+                summary.blocks.append(Block(index.chunk_start_offset, *times))
     except _DAMAGE:
         return None
     return summary if summary.channels else None
 
 
-def _one_record(opcode: int, body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
-    stream = ReadDataStream(BytesIO(body))
+def _one_record(
+    opcode: int, body: bytes | memoryview, at: int, losses: Losses
+) -> Iterator[tuple[int, Record]]:
     record: Record
     try:
         if opcode == Opcode.MESSAGE:
-            record = Message.read(stream, len(body))
+            channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+            record = Message(channel, log_time, bytes(body[_MESSAGE_HEAD.size :]), publish_time, sequence)
         elif opcode == Opcode.CHANNEL:
-            record = Channel.read(stream)
+            record = Channel.read(ReadDataStream(BytesIO(body)))
         else:
-            record = Schema.read(stream)
+            record = Schema.read(ReadDataStream(BytesIO(body)))
     except _DAMAGE as error:
         losses.add("damaged record", len(body), f"byte {at}: {error or type(error).__name__}")
     else:
@@ -281,7 +302,7 @@ def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, 
     except _DAMAGE as error:
         losses.add("damaged chunk", len(body), f"byte {at}: {error or type(error).__name__}")
         return
-    inner = 0
+    inner, view = 0, memoryview(data)
     while inner < len(data):
         start = inner + _FRAME.size
         opcode, length = _FRAME.unpack_from(data, inner) if start <= len(data) else (0, 0)
@@ -290,7 +311,7 @@ def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, 
             return
         inner = start + length
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield from _one_record(opcode, data[start:inner], at, losses)
+            yield from _one_record(opcode, view[start:inner], at, losses)
 
 
 def _decompress(chunk: Chunk) -> bytes:

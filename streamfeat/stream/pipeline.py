@@ -1,17 +1,18 @@
 """The asynchronous pipeline: source, processor and sinks, joined by bounded queues.
 
-Lives here: its tasks and queues, pacing, and ending well.
-Not here: what is computed (`session`, `cameras`), read (`recordings`, `live`) or written (`sinks`); threads
-(`threads`) and signals (`signals`).
+Lives here: its tasks and queues, and ending well.
+Not here: what is computed (`session`, `cameras`), read (`recordings`, `live`) or written (`sinks`); pace and
+groups (`pacing`), threads (`threads`), signals (`signals`).
 
 Three tasks (`_Stages`): one reads and decodes, one runs the kernels, one writes. Blocking work happens in a
-thread of each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full, the
-task that fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live source
-cannot make a camera wait: it has an inbox of its own, which says what it does when it is full (`live.inbox`).
+thread of each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full,
+the task that fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live
+source cannot make a camera wait: it has an inbox of its own, which says what happens when it is full
+(`live.inbox`).
 
 A live source also says when nothing more is there. If nothing is under way either, the thread that reads also
-processes and writes (`_Bypass`): no other thread has anything to do meanwhile, and each hop between threads and
-the loop costs about a tenth of a millisecond, more on a machine that is busy.
+processes and writes (`_Bypass`): no other thread has anything to do meanwhile, and each hop between
+threads and the loop costs about a tenth of a millisecond, more on a machine that is busy.
 
 Ending: when the source is exhausted or `stop` is set, what is in the queues is processed and the sinks are
 closed. When a task fails or `run` is cancelled, the tasks end as soon as their threads return, and the sinks
@@ -21,30 +22,22 @@ are closed as failed. Sinks are closed in a thread, and after all others have en
 import asyncio
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
-from streamfeat.messages.packets import Label, Packet
+from streamfeat.stream.pacing import Group, In, Pace, groups_of, stream_time
 from streamfeat.stream.sinks import Sink
 from streamfeat.stream.threads import Threads
 
 __all__ = ["Pipeline", "PipelineStats", "Processor"]
 
-In = TypeVar("In")
 Out = TypeVar("Out")
 Taken = TypeVar("Taken", contravariant=True)
 Made = TypeVar("Made", covariant=True)
 
 _QUEUE_ITEMS = 8
-_EVENTS_A_HOP = 32_768
-"""Items are handed on in groups of about so many events: a hop between threads costs 50 to 100 us."""
-_ITEMS_A_HOP = 256
 _EMISSIONS_A_HOP = 256
-_PACED_SLICE_US = 10_000
-"""Paced packets are cut to this length of the clock, so that nothing waits for the end of a long packet."""
 
 
 @dataclass(slots=True)
@@ -140,7 +133,11 @@ class Pipeline(Generic[In, Out]):
             stages = _Stages(self._processor, self._sinks, self._traffic, threads)
             try:
                 async with asyncio.TaskGroup() as tasks:
-                    tasks.create_task(stages.read(self._groups(), bypass, self._speed, self._on_progress))
+                    tasks.create_task(
+                        stages.read(
+                            groups_of(self._items, self._speed), bypass, self._speed, self._on_progress
+                        )
+                    )
                     tasks.create_task(stages.compute())
                     tasks.create_task(stages.write())
             except BaseExceptionGroup as group:
@@ -154,11 +151,6 @@ class Pipeline(Generic[In, Out]):
                     raise
         if failure:
             raise failure
-
-    def _groups(self) -> "Iterator[_Group[In]]":
-        if self._speed is None:
-            return _full_groups(self._items)
-        return _paced_groups(self._items, round(_PACED_SLICE_US * max(self._speed, 1.0)))
 
 
 @dataclass(slots=True)
@@ -200,22 +192,20 @@ class _Stages(Generic[In, Out]):
 
     async def read(
         self,
-        groups: "Iterator[_Group[In]]",
+        groups: Iterator[Group[In]],
         bypass: "_Bypass[In, Out]",
         speed: float | None,
         on_progress: Callable[[int], None],
     ) -> None:
         traffic = self._traffic
-        started: tuple[float, int] | None = None
+        pace = Pace(speed)
         while not traffic.stop.is_set():
             group = await self._threads.run(bypass.next_group, groups)
             if group is None:
                 break
-            t_us = _stream_time(group)
+            t_us = stream_time(group)
             if speed is not None and t_us is not None:
-                started = started or (time.monotonic(), t_us)
-                due = started[0] + (t_us - started[1]) / (1e6 * speed)
-                await self._sleep_until(due)
+                await self._sleep_until(pace.due(group[-1], t_us, time.monotonic()))
             traffic.under_way += 1
             await traffic.inbox.put(group)
             traffic.items += len(group)
@@ -269,7 +259,7 @@ class _Bypass(Generic[In, Out]):
         self._processor, self._sinks = processor, sinks
         self._traffic, self._threads = traffic, threads
 
-    def next_group(self, groups: "Iterator[_Group[In]]") -> list[In] | None:
+    def next_group(self, groups: Iterator[Group[In]]) -> list[In] | None:
         """The next group that the other tasks shall see to; None at the end, or when that has come early."""
         while not (self._traffic.stop.is_set() or self._threads.cancelled):
             found = next(groups, None)
@@ -310,48 +300,3 @@ def _close_all(sinks: Sequence[Sink[Out]], *, failed: bool) -> None:
 
 def _take(emissions: Iterator[Out]) -> list[Out]:
     return list(islice(emissions, _EMISSIONS_A_HOP))
-
-
-@dataclass(slots=True)
-class _Group(Generic[In]):
-    """Items that go together, none if there are none at the moment; `more` may be there already."""
-
-    items: list[In]
-    more: bool = True
-
-
-def _full_groups(items: Iterable[In | None]) -> Iterator[_Group[In]]:
-    group: list[In] = []
-    events = 0
-    for item in items:
-        if item is not None:
-            group.append(item)
-            events += len(item.events) if isinstance(item, Packet) else 0
-        if item is None or events >= _EVENTS_A_HOP or len(group) == _ITEMS_A_HOP:
-            yield _Group(group, more=item is not None)
-            group, events = [], 0
-    if group:
-        yield _Group(group)
-
-
-def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[_Group[In]]:
-    for item in items:
-        if item is None:
-            continue
-        if not isinstance(item, Packet) or len(item.events) == 0:
-            yield _Group([item])
-            continue
-        latest = np.maximum.accumulate(item.events["t"])
-        start = 0
-        while start < len(latest):
-            stop = int(np.searchsorted(latest, latest[start] + slice_us))
-            yield _Group([replace(item, events=item.events[start:stop])])
-            start = stop
-
-
-def _stream_time(group: Sequence[object]) -> int | None:
-    """The time by which a group is complete: that of its latest event."""
-    last = group[-1]
-    if isinstance(last, Label):
-        return last.start_us
-    return int(last.events["t"].max()) if isinstance(last, Packet) and len(last.events) else None

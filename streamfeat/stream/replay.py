@@ -13,11 +13,13 @@ from typing import Any, TextIO
 from rich.console import Console
 
 from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.files.locations import Location
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Label, Packet, Recording, open_recording
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.writer import RecordingWriter
@@ -41,6 +43,7 @@ class ReplayJob:
         emit: when to read, see `EmitPolicy.parse`.
         speed: a number for a multiple of the recorded pace, or `max`.
         topic: event topic, where there are several.
+        reading: how to read the recording.
         split: replay only samples of this split.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
@@ -58,6 +61,7 @@ class ReplayJob:
         emit: str = "auto",
         speed: str = "max",
         topic: str | None = None,
+        reading: ReadOptions = AS_IT_IS,
         split: str | None = None,
         learn_online: bool = False,
         engine: Callable[..., Engine] = Engine,
@@ -66,11 +70,12 @@ class ReplayJob:
         policy = EmitPolicy.parse(emit)
         self._speed = parse_speed(speed)
         self._split = split
-        self._topic = topic
+        self._topic, self._reading = topic, reading
         self._recording = recording
         encoder = Encoder.load(model)
-        reader = Classifier.load(classifier) if classifier else None
-        with open_recording(recording, topic) as rec:
+        reader = load_classifier(classifier) if classifier else None
+        with open_recording(recording, topic, reading) as rec:
+            self.assumptions = rec.assumptions
             encoder.geometry.grid_shape(rec.resolution)
             if learn_online and reader is None:
                 reader = Classifier.untrained([label.label for label in rec.labels], encoder)
@@ -118,7 +123,7 @@ class ReplayJob:
             report: called with (step, done, of how many, remark) as packets and labels are read, from a
                 thread.
         """
-        with open_recording(self._recording, self._topic) as rec, signals_wait():
+        with open_recording(self._recording, self._topic, self._reading) as rec, signals_wait():
             self._played = rec
             sinks = open_sinks(
                 partial(TerminalSink, console, every_sample=every_sample) if console else None,
@@ -166,7 +171,10 @@ class ReplayJob:
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         if stats.unknown_labels:
             result["unknown_labels"] = stats.unknown_labels
-        return result | self.drops() | {"saturated": stats.saturated, "interrupted": self.interrupted}
+        removed = dict(self.losses.removed)
+        return (
+            result | self.drops() | removed | {"saturated": stats.saturated, "interrupted": self.interrupted}
+        )
 
 
 def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterator[Packet | Label]:

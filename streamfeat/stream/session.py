@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.kernel import KernelClassifier
+from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution
@@ -43,12 +45,14 @@ class Session:
     Args:
         encoder: the frozen encoder.
         policy: when to read.
-        classifier: predicts from each reading.
+        classifier: predicts from each reading; of one with a kernel the linear one beside it where each event
+            is read, or where it learns online.
         learn_online: learn from each labelled sample after predicting it (prequential).
         clock: seconds, monotonic; used by the `auto` policy and by those who are behind.
         topic: named in emissions.
         is_behind: tells from `log_time_ns` of the packet in hand whether it has waited too long.
         engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
+        denoising: noise that is taken out before anything is counted; no part of a snapshot.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -58,27 +62,31 @@ class Session:
         self,
         encoder: Encoder,
         policy: EmitPolicy,
-        classifier: Classifier | None = None,
+        classifier: Classifier | KernelClassifier | None = None,
         *,
         learn_online: bool = False,
         clock: Callable[[], float] = lambda: 0.0,
         topic: str = "",
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
+        denoising: Denoising | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
         self.policy = policy
-        self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
+        self._every_event = policy == EmitPolicy("events", 1)
+        if classifier and (learn_online or self._every_event):
+            classifier = classifier.linear
+        self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
         self._clock = clock
         self._topic = topic
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
-        self._every_event = policy == EmitPolicy("events", 1)
+        self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
         self._state = SessionState(every_us=every_us)
@@ -88,7 +96,7 @@ class Session:
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
-    def classifier(self) -> Classifier | None:
+    def classifier(self) -> Classifier | KernelClassifier | None:
         """The classifier as it is now."""
         return self.learner.classifier if self.learner else self._classifier
 
@@ -128,6 +136,8 @@ class Session:
 
     def process(self, item: StreamItem) -> Iterator[Emission]:
         """Take in one item of the stream, and yield what is read on the way."""
+        if self.denoiser:
+            item = self.denoiser.process(item)
         if isinstance(item, Watermark):
             self._source_ns = 0
             yield from self._pass_time(item.t_us)

@@ -9,8 +9,9 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import current_thread, main_thread
+from typing import Any
 
-from streamfeat.stream.pipeline import In, Out, Pipeline
+from streamfeat.stream.pipeline import Pipeline
 
 __all__ = ["run_until_interrupted", "signals_wait"]
 
@@ -31,7 +32,7 @@ def signals_wait() -> Iterator[None]:
 
 
 def run_until_interrupted(
-    pipelines: Sequence[Pipeline[In, Out]], interrupt: Callable[[], None] | None = None
+    pipelines: Sequence[Pipeline[Any, Any]], interrupt: Callable[[], None] | None = None
 ) -> bool:
     """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
 

@@ -52,6 +52,13 @@ SCHEMAS = {
         samples=_NUMBER,
         right=_NUMBER,
     ),
+    "engine": _object(
+        "streamfeat.Engine",
+        t_s=_NUMBER,
+        active_volumes=_NUMBER,
+        volumes=_NUMBER,
+        update_us=_object("update", median=_NUMBER, max=_NUMBER, n=_NUMBER),
+    ),
     "status": _object(
         "streamfeat.Status",
         t_s=_NUMBER,
@@ -59,9 +66,6 @@ SCHEMAS = {
         camera=_TEXT,
         events=_NUMBER,
         events_per_s=_NUMBER,
-        active_volumes=_NUMBER,
-        volumes=_NUMBER,
-        update_us=_object("update", median=_NUMBER, max=_NUMBER, n=_NUMBER),
         drops={"type": "object", "additionalProperties": _NUMBER},
     ),
 }
