@@ -403,9 +403,10 @@ import sys
 from pathlib import Path
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
+from streamfeat.live.network import Network
 model, state, port, reliable = sys.argv[1:]
 never = dict(silence_s=1e9, patience_s=1e9, max_delay_s=1e9)
-never |= dict(port=int(port), reliable=reliable == "True", state=Path(state), state_every_s=0.02)
+never |= dict(network=Network(None, int(port), reliable == "True"), state=Path(state), state_every_s=0.02)
 job = ListenJob(PlainNames("cam/*/events"), Path(model), emit="10ms", **never)
 job.run()
 import json

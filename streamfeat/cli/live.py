@@ -140,7 +140,9 @@ def listen(
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
     from streamfeat.live.listen import ListenJob
+    from streamfeat.live.network import Network
     from streamfeat.live.shard import Shard
+    from streamfeat.stream.outputs import Outputs
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -150,9 +152,7 @@ def listen(
         "emit": emit,
         "learn_online": learn_online,
         "denoising": denoising_of(hot_pixels, refractory, isolated) or None,
-        "reliable": reliable,
-        "zenoh_config": zenoh_config,
-        "port": port,
+        "network": Network(zenoh_config, port, reliable),
         "max_delay_s": max_delay,
         "state": state,
     }
@@ -170,12 +170,14 @@ def listen(
     )
     to_terminal = str(json_lines) == "-"
     job.run(
-        console=None if quiet or as_json or to_terminal else out,
-        every_sample=verbose,
-        recording_out=output,
-        json_lines=sys.stdout if to_terminal else json_lines,
-        with_features=features,
-        table=table,
+        Outputs(
+            console=None if quiet or as_json or to_terminal else out,
+            every_sample=verbose,
+            recording=output,
+            json_lines=sys.stdout if to_terminal else json_lines,
+            with_features=features,
+            table=table,
+        )
     )
     if not to_terminal:
         print_result(job.result(), "heard", as_json=as_json)
@@ -229,6 +231,7 @@ def publish(
 ) -> None:
     """Recordings as live cameras, at their own pace or faster; several at once."""
     from streamfeat.live.names import PlainNames, RosNames
+    from streamfeat.live.network import Network
     from streamfeat.live.publish import PublishJob
     from streamfeat.stream.replay import parse_speed
 
@@ -245,10 +248,8 @@ def publish(
         speed=parse_speed(speed),
         loop=loop,
         encoding=encoding,
-        reliable=reliable,
         wait_s=wait,
-        zenoh_config=zenoh_config,
-        port=port,
+        network=Network(zenoh_config, port, reliable),
     )
     print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
@@ -272,6 +273,7 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
+    from streamfeat.live.network import Network
     from streamfeat.live.record import RecordJob
 
     refuse_existing(output, overwrite=overwrite)
@@ -281,9 +283,7 @@ def record(
         compression=compression,  # type: ignore[arg-type]
         chunk_s=chunk,
         overwrite=overwrite,
-        reliable=reliable,
-        zenoh_config=zenoh_config,
-        port=port,
+        network=Network(zenoh_config, port, reliable),
         console=err,
     )
     with progress_bars(quiet=quiet) as report:
@@ -322,9 +322,11 @@ def topics(
     """Event topics that somebody publishes on, plain zenoh and ROS 2."""
     from dataclasses import asdict
 
-    from streamfeat.live.network import find_topics, open_session
+    from streamfeat.live.network import Network, find_topics
 
-    with open_session(zenoh_config, port=port) as session:
+    if not 0 <= seconds < 1e6:
+        raise InputError(f"--seconds {seconds}: give a number from 0 on")
+    with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
     if as_json:
         print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)

@@ -70,7 +70,8 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
-    from streamfeat.stream.replay import ReplayJob
+    from streamfeat.stream.outputs import Outputs
+    from streamfeat.stream.replay import ReplayJob, parse_speed
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -80,7 +81,7 @@ def replay(
         model,
         classifier,
         emit=emit,
-        speed=speed,
+        speed=parse_speed(speed),
         topic=topic,
         reading=reading,
         split=split,
@@ -90,13 +91,15 @@ def replay(
     to_terminal = str(json_lines) == "-"
     with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
         job.run(
-            console=None if quiet or as_json or to_terminal else out,
-            every_sample=verbose,
-            recording_out=output,
-            json_lines=sys.stdout if to_terminal else json_lines,
-            with_features=features,
-            table=table,
-            report=report,
+            Outputs(
+                console=None if quiet or as_json or to_terminal else out,
+                every_sample=verbose,
+                recording=output,
+                json_lines=sys.stdout if to_terminal else json_lines,
+                with_features=features,
+                table=table,
+            ),
+            report,
         )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)

@@ -90,6 +90,7 @@ def view(
     With a model: bins, active volumes, features and latency, too; with a classifier its scores. A recording
     begins when somebody looks, and can be paused and sought in until Ctrl-C.
     """
+    from streamfeat.live.network import Network
     from streamfeat.recordings.options import AS_IT_IS
     from streamfeat.stream.replay import parse_speed
     from streamfeat.view.job import View, has_display
@@ -116,7 +117,7 @@ def view(
             raise InputError(
                 "--loop, --speed, --split, --topic and what tells how to read are for recordings"
             )
-        options = {"zenoh_config": zenoh_config, "port": zenoh_port, "console": err}
+        options = {"network": Network(zenoh_config, zenoh_port), "console": err}
     job = View(
         recording or names_of(source, ros2, domain),
         model,

@@ -31,10 +31,10 @@ from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.simulate.saccades import CameraModel, digit_samples
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
-from streamfeat.stream.replay import warm_up
 from streamfeat.stream.session import Session
 from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import Sink, TerminalSink
+from streamfeat.stream.warming import warm_up
 
 __all__ = ["FILES", "Demo"]
 

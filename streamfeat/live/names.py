@@ -139,6 +139,21 @@ class PlainNames:
 
     expression: str
 
+    def __post_init__(self) -> None:
+        """Check the argument.
+
+        Raises:
+            InputError: it begins or ends with a slash, or is empty, as no key is.
+        """
+        bare = self.expression.strip("/")
+        if not bare:
+            raise InputError(f"{self.expression!r} is no zenoh key; give one such as robot/cam0/events")
+        if bare != self.expression:
+            raise InputError(
+                f"{self.expression!r} is no zenoh key, for those have no slash at either end; give {bare!r}, "
+                "or --ros2 for a ROS 2 topic"
+            )
+
     @property
     def subscriptions(self) -> list[str]:
         """See `Names`."""

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -16,7 +15,7 @@ import zenoh
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.live.names import Names
-from streamfeat.live.network import DEFAULT_PORT, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import CameraSink
 from streamfeat.messages.cdr import EventPacket, LabelMessage
 from streamfeat.messages.packets import Label, Packet, PacketWriter
@@ -42,10 +41,8 @@ class PublishJob:
         speed: stream seconds for each second of the clock; None for as fast as readers take it.
         loop: start again at the end, with times that go on.
         encoding: of the payloads.
-        reliable: keep packets for readers that missed them.
-        wait_s: how long to wait for somebody to subscribe.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
+        wait_s: how long to wait for a subscriber.
+        network: where to publish; `reliable` keeps packets for readers that missed them.
 
     Raises:
         InputError: a recording cannot be read, or an argument makes no sense.
@@ -61,12 +58,12 @@ class PublishJob:
         speed: float | None = 1.0,
         loop: bool = False,
         encoding: str = "mono",
-        reliable: bool = False,
         wait_s: float = 1.0,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
+        network: Network = THIS_MACHINE,
     ) -> None:
         """Check the arguments."""
+        if not 0 <= wait_s < 1e9:
+            raise InputError(f"--wait {wait_s}: give seconds from 0 on")
         topics = [topic for _, topic in sources]
         if len(set(topics)) < len(topics) or any("*" in topic for topic in topics):
             raise InputError(f"each recording needs a topic of its own, without wildcards, not {topics}")
@@ -78,8 +75,7 @@ class PublishJob:
         self._sources, self._names = sources, names
         self._topic, self._reading = topic, reading
         self._speed, self._loop, self._encoding = speed, loop, encoding
-        self._reliable, self._wait_s = reliable, wait_s
-        self._zenoh_config, self._port = zenoh_config, port
+        self._wait_s, self._network = wait_s, network
         self._cutters: list[_Cutter] = []
         self._sinks: list[CameraSink] = []
         self._seconds = 0.0
@@ -95,8 +91,8 @@ class PublishJob:
                 thread.
         """
         # Only those without a pace of their own can wait for readers; a camera cannot.
-        options = {"block": self._speed is None, "reliable": self._reliable}
-        with open_session(self._zenoh_config, port=self._port) as session, ExitStack() as recordings:
+        options = {"block": self._speed is None, "reliable": self._network.reliable}
+        with self._network.open() as session, ExitStack() as recordings:
             self._sinks = open_sinks(
                 *(partial(CameraSink, session, self._names, topic, **options) for _, topic in self._sources)
             )

@@ -20,7 +20,8 @@ from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
-from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
+from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.delivery import Delivery, DeliveryStats
@@ -49,9 +50,7 @@ class RecordJob:
         compression: of chunks.
         chunk_s: seconds that a crash can cost.
         overwrite: whether an existing file may be replaced.
-        reliable: recover missed packets, from publishers that do the same.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
+        network: where to listen; `reliable` recovers missed packets, from publishers that do the same.
         console: for warnings.
 
     Raises:
@@ -66,9 +65,7 @@ class RecordJob:
         compression: Literal["zstd", "lz4", "none"] = "lz4",
         chunk_s: float = 0.5,
         overwrite: bool = False,
-        reliable: bool = False,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
+        network: Network = THIS_MACHINE,
         console: Console | None = None,
     ) -> None:
         """Check the arguments."""
@@ -76,7 +73,7 @@ class RecordJob:
             raise InputError(f"a chunk of {chunk_s} s is not possible; give 0.01 to 3600")
         self._names, self._target = names, target
         self._compression, self._chunk_s, self._overwrite = compression, chunk_s, overwrite
-        self._reliable, self._zenoh_config, self._port = reliable, zenoh_config, port
+        self._network = network
         self._inbox = Inbox()
         self._warnings = Warnings.on(console)
         self._topics: dict[str, Delivery] = {}
@@ -96,7 +93,7 @@ class RecordJob:
         Raises:
             InputError: the file cannot be written, or the network not be used.
         """
-        with open_session(self._zenoh_config, port=self._port) as session, signals_wait():
+        with self._network.open() as session, signals_wait():
             (sink,) = open_sinks(
                 lambda: _MessageSink(
                     RecordingWriter(
@@ -111,7 +108,7 @@ class RecordJob:
                 self._items(report), _Unchanged(), [sink]
             )
             started = time.monotonic()
-            with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+            with Subscription(session, self._names, self._inbox, reliable=self._network.reliable):
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
             self._seconds = time.monotonic() - started
 

@@ -23,7 +23,8 @@ from streamfeat.files.locations import Location
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.replay import warm_up
+from streamfeat.stream.outputs import Outputs
+from streamfeat.stream.warming import warm_up
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
 from streamfeat.view.page import page
@@ -139,6 +140,7 @@ class View:
                 emit=emit,
                 engine_of=self._engine_of,
                 tap=self._tap.items,
+                publish=False,
                 **options,
             )
         else:
@@ -162,7 +164,7 @@ class View:
             if self._stopped.is_set():
                 return
             if isinstance(self._job, ListenJob):
-                self._job.run(more=self._sink, publish=False)
+                self._job.run(Outputs(more=self._sink))
             else:
                 self._job.run(self._tap, self._sink)
 

@@ -7,7 +7,6 @@ Not here: pictures and boards (`sink`), the player itself (`player`), listening 
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -21,7 +20,8 @@ from streamfeat.files.locations import Location
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake, Warnings
 from streamfeat.live.names import Names
-from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
+from streamfeat.live.subscription import Subscription
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Recording, open_recording
@@ -162,9 +162,7 @@ class WatchJob:
 
     Args:
         names: of the topics.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
-        reliable: recover missed packets, from publishers that do the same.
+        network: where to listen; `reliable` recovers missed packets, from publishers that do the same.
         console: for warnings.
     """
 
@@ -172,13 +170,11 @@ class WatchJob:
         self,
         names: Names,
         *,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
-        reliable: bool = False,
+        network: Network = THIS_MACHINE,
         console: Console | None = None,
     ) -> None:
         """Nothing is subscribed to before `run`."""
-        self._names, self._zenoh_config, self._port, self._reliable = names, zenoh_config, port, reliable
+        self._names, self._network = names, network
         self._inbox = Inbox()
         self._intake = Intake(self._inbox, _WINDOW_US, Warnings.on(console))
         self.interrupted = False
@@ -189,9 +185,9 @@ class WatchJob:
         Raises:
             InputError: the network cannot be used.
         """
-        with open_session(self._zenoh_config, port=self._port) as session, signals_wait():
+        with self._network.open() as session, signals_wait():
             pipeline: Pipeline[Any, Emission] = Pipeline(tap.items(self._intake), NoFeatures(), [sink])
-            with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+            with Subscription(session, self._names, self._inbox, reliable=self._network.reliable):
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
 
     def stop(self) -> None:
