@@ -110,13 +110,13 @@ def test_times_are_counted_from_the_start_of_a_sample():
 def test_auto_rests_four_times_as_long_as_reading_takes():
     clock = FakeClock()
     session = Session(MODEL, EmitPolicy.parse("auto"), clock=clock)
-    reading = session._read
+    reading = session._emit
 
     def slow_reading(*args, **options):
         clock.now += 1.0
         return reading(*args, **options)
 
-    session._read = slow_reading
+    session._emit = slow_reading
     read_at = []
     for i in range(40):
         clock.now = max(clock.now, 0.5 * i)
