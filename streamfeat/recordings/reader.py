@@ -32,6 +32,7 @@ from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
 from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
+from streamfeat.report.shown import Shown
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -96,7 +97,7 @@ def open_recording(
     return Recording(path, topic, options=options)
 
 
-class Recording:
+class Recording(Shown):
     """A recording of events, read in file order; iterate as often as you like.
 
     `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass
