@@ -14,14 +14,17 @@ import typer
 from streamfeat.cli.program import (
     AnyLocation,
     ClusterOption,
+    EmitOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
+    SpeedOption,
     TopicOption,
     VerboseOption,
     WorkersOption,
     app,
+    completing,
     err,
     out,
     print_losses,
@@ -84,7 +87,7 @@ def listen(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    emit: EmitOption = "auto",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
     ] = None,
@@ -217,9 +220,15 @@ def publish(
     ],
     reading: "ReadOptions",
     topic: TopicOption = None,
-    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "1",
+    speed: SpeedOption = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
-    encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
+    encoding: Annotated[
+        str,
+        typer.Option(
+            help="Payload: mono, libcaer_cmp, libcaer or evt3.",
+            autocompletion=completing("mono", "libcaer_cmp", "libcaer", "evt3"),
+        ),
+    ] = "mono",
     wait: Annotated[float, typer.Option(help="Seconds to wait for somebody to subscribe.")] = 1.0,
     ros2: Annotated[bool, typer.Option("--ros2", help="Keys are ROS 2 topics (rmw_zenoh).")] = False,
     domain: DomainOption = 0,
@@ -261,7 +270,10 @@ def publish(
 def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")],
     key: KeyArgument = None,
-    compression: Annotated[str, typer.Option(help="Chunks: lz4, zstd or none.")] = "lz4",
+    compression: Annotated[
+        str,
+        typer.Option(help="Chunks: lz4, zstd or none.", autocompletion=completing("lz4", "zstd", "none")),
+    ] = "lz4",
     chunk: Annotated[float, typer.Option(help="Seconds that a crash can cost.")] = 0.5,
     ros2: RosOption = None,
     domain: DomainOption = 0,

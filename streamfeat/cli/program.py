@@ -38,17 +38,20 @@ if TYPE_CHECKING:
 __all__ = [
     "AnyLocation",
     "ClusterOption",
+    "EmitOption",
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
     "QuietOption",
     "RecordingArgument",
     "RecordingsArgument",
+    "SpeedOption",
     "StepsOption",
     "TopicOption",
     "VerboseOption",
     "WorkersOption",
     "app",
+    "completing",
     "err",
     "out",
     "print_losses",
@@ -81,12 +84,43 @@ app = typer.Typer(
     cls=_InOrder,
     help="Learned features from event cameras: event by event, exact, and never behind.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain pages: for others Typer imports a parser of Markdown, a third of a start
     pretty_exceptions_enable=False,
 )
 
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=lambda asked: _tell_version(asked), help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"streamfeat {version('streamfeat')}")
+        raise typer.Exit
+
+
+def completing(*values: str) -> Callable[[str], list[str]]:
+    """A function for a shell that completes the value of an option: those that begin as what is typed."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [value for value in values if value.startswith(incomplete)]
+
+    return complete
+
 
 if TYPE_CHECKING:
     AnyLocation = Location
@@ -104,6 +138,19 @@ RecordingsArgument = Annotated[
 TopicOption = Annotated[
     str | None,
     typer.Option("--topic", "--stream", help="Event topic or stream, where a recording has several."),
+]
+EmitOption = Annotated[
+    str,
+    typer.Option(
+        help="When to emit features: event, 1000ev, 10ms or auto.",
+        autocompletion=completing("event", "1000ev", "10ms", "auto"),
+    ),
+]
+SpeedOption = Annotated[
+    str,
+    typer.Option(
+        help="1 is the recorded pace, 2 twice that, or max.", autocompletion=completing("1", "2", "max")
+    ),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from streamfeat.cli.program import (
+    EmitOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     RecordingArgument,
+    SpeedOption,
     TopicOption,
     VerboseOption,
     app,
@@ -45,8 +47,8 @@ def replay(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
-    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "max",
+    emit: EmitOption = "auto",
+    speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
     ] = None,

@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from streamfeat.cli.live import ConfigOption, DomainOption, RosOption, names_of
 from streamfeat.cli.program import (
+    EmitOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
@@ -47,7 +48,7 @@ def view(
         Path | None,
         typer.Option("--classifier", "-c", help="Show predictions, too, of this classifier."),
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    emit: EmitOption = "auto",
     web: Annotated[
         bool | None,
         typer.Option("--web/--no-web", help="Serve the page. Served unless there is -o or --foxglove."),
