@@ -100,13 +100,19 @@ Threshold = Annotated[
     ),
 ]
 Start = Annotated[
-    str | None, typer.Option(help="Of learning: kmeans or random.", show_default=_shown("start"))
+    str | None,
+    typer.Option(
+        help="Of learning: kmeans or random.",
+        show_default=_shown("start"),
+        autocompletion=completing("kmeans", "random"),
+    ),
 ]
 Rows = Annotated[
     str | None,
     typer.Option(
         help="Length of the filters while they are learned: unit, or free; direct only.",
         show_default=_shown("rows"),
+        autocompletion=completing("unit", "free"),
     ),
 ]
 Conditioning = Annotated[
@@ -139,7 +145,8 @@ Kernel = Annotated[
     str,
     typer.Option(
         help="Of the classifier: linear, or rbf, which is more accurate and takes about a millisecond for an "
-        "emission; --emit event and --learn-online use the linear one beside it."
+        "emission; --emit event and --learn-online use the linear one beside it.",
+        autocompletion=completing("linear", "rbf"),
     ),
 ]
 

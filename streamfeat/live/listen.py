@@ -109,11 +109,10 @@ class ListenJob:
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
-        for name, seconds in (("max_delay", max_delay_s), ("silence", silence_s), ("patience", patience_s)):
+        limits = {"delay": max_delay_s, "silence": silence_s, "patience": patience_s}
+        for name, seconds in limits.items():
             if not seconds >= 0:
-                raise InputError(
-                    f"a {name} of {seconds} s is not possible; give a number that is not negative"
-                )
+                raise InputError(f"a {name} of {seconds} s is not possible; give a number from 0 on")
         self._encoder, self._classifier = open_models(model, classifier)
         if learn_online and self._classifier is None:
             raise InputError("--learn-online needs a classifier to start from; give one with -c")

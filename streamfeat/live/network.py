@@ -9,6 +9,7 @@ that they know. A ROS 2 router (`rmw_zenohd`) on this machine is found in the sa
 """
 
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -50,6 +51,7 @@ _MEETING_S = 8.0
 """How long a busy machine may take to answer a session that connects, before the port is taken for another
 program's."""
 _POLL_S = 0.01
+_RUST_PLACE = re.compile(r",? at /\S+\.rs(:\d+)?\.?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +161,7 @@ def _loopback(listen: list[str], connect: list[str]) -> zenoh.Config:
 
 def first_line(error: Exception) -> str:
     """What zenoh says of an error, without where in its sources."""
-    return str(error).splitlines()[0][:300]
+    return _RUST_PLACE.sub("", str(error).splitlines()[0][:600])[:300]
 
 
 class TopicWatch:

@@ -23,6 +23,7 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
+from streamfeat.live.network import first_line
 from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.stream.cameras import MAX_CAMERAS
 from streamfeat.stream.emission import Emission
@@ -92,7 +93,7 @@ class MessagePublisher:
             self._open += [session.liveliness().declare_token(token) for token in tokens]
         except zenoh.ZError as error:
             self.close()
-            raise InputError(f"{key!r} cannot be published on: {str(error).splitlines()[0][:200]}") from None
+            raise InputError(f"{key!r} cannot be published on: {first_line(error)}") from None
 
     def put(self, data: bytes) -> None:
         """Publish one message."""
