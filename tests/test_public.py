@@ -89,3 +89,24 @@ def test_learning_takes_paths_and_open_recordings_and_refuses_the_rest(folder):
         sf.learn_encoder([])
     with pytest.raises(sf.InputError, match="no preset"):
         sf.learn_encoder(folder / "digits.mcap", preset="best")
+
+
+def test_the_page_of_the_room_shows_programs_that_run(monkeypatch, capsys):
+    root = Path(__file__).parents[1]
+    page = (root / "streamfeat" / "stream" / "README.md").read_text()
+    first, second = (part.split("```")[0] for part in page.split("```python\n")[1:])
+    monkeypatch.chdir(root)
+    known = {}
+    exec(compile(first, "page", "exec"), known)
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == known["asyncio"].run(counted(known)) + 1
+    assert said[-1].startswith("StreamStats(")
+    known |= {"encoder": sf.Encoder.load("recordings/digits.safetensors"), "classifier": None}
+    exec(compile(second.replace("drive.mcap", "recordings/digits_test.mcap"), "page", "exec"), known)
+    asyncio.run(known["main"]())
+    assert capsys.readouterr().out.splitlines()[-1] == "done"
+
+
+async def counted(known):
+    with sf.open_recording("recordings/digits_test.mcap") as recording:
+        return len(recording.labels)
