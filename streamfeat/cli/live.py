@@ -129,7 +129,8 @@ def listen(
     announced: Annotated[
         bool,
         typer.Option(
-            "--announced", help="Hear only cameras with a liveliness token, and no others' packets."
+            "--announced",
+            help="Hear only cameras with a liveliness token; packets of others are not sent here.",
         ),
     ] = False,
     cluster: ClusterOption = None,
@@ -229,7 +230,7 @@ def publish(
             autocompletion=completing("mono", "libcaer_cmp", "libcaer", "evt3"),
         ),
     ] = "mono",
-    wait: Annotated[float, typer.Option(help="Seconds to wait for somebody to subscribe.")] = 1.0,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for a subscriber.")] = 1.0,
     ros2: Annotated[bool, typer.Option("--ros2", help="Keys are ROS 2 topics (rmw_zenoh).")] = False,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
@@ -314,7 +315,7 @@ def recover(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Whatever can be read of a damaged recording, in a new and intact one."""
+    """Copy everything readable of a damaged recording into a new, intact one."""
     from streamfeat.recordings.writer import recover as recover_recording
 
     with progress_bars(quiet=quiet) as report:
@@ -331,7 +332,7 @@ def topics(
     port: PortOption = 7447,
     as_json: JsonOption = False,
 ) -> None:
-    """Event topics that somebody publishes on, plain zenoh and ROS 2."""
+    """Topics that events are published on, plain zenoh and ROS 2."""
     from dataclasses import asdict
 
     from streamfeat.live.network import Network, find_topics
@@ -347,4 +348,4 @@ def topics(
         where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"
         out.print(f"{topic.name}  [dim]{where}, publishers: {topic.publishers}[/]", soft_wrap=True)
     if not found:
-        out.print("nobody publishes events")
+        out.print("no topic with events was found")

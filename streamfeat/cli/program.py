@@ -66,7 +66,7 @@ _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
 class _InOrder(TyperGroup):
-    """Commands in the order in which somebody new needs them, each with its whole first sentence."""
+    """Commands in the order in which a newcomer needs them, each with its whole first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -167,7 +167,7 @@ ClusterOption = Annotated[
     typer.Option(metavar="ADDRESS", help="Work on the cluster of this Dask scheduler; extra `cluster`."),
 ]
 WorkersOption = Annotated[
-    int | None, typer.Option(help="Work in so many processes of this machine; extra `cluster`.")
+    int | None, typer.Option(help="Number of processes of this machine to work in; extra `cluster`.")
 ]
 
 _NARROW = 90
@@ -183,7 +183,7 @@ class _RateColumn(ProgressColumn):
 
 
 Report = Callable[[str, int, int, str], None]
-"""Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
+"""Called with (step, done, of how many, remark); of how many is 0 where that is unknown."""
 
 
 @contextlib.contextmanager
@@ -197,7 +197,7 @@ def progress_bars(
 
     Args:
         from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
-            called, once a second at most, so that nothing else runs while somebody measures.
+            called, once a second at most, so that nothing else runs during a measurement.
         quiet: show nothing.
         as_lines: in place of bars a line for each step's begin and end, and one a second between them,
             terminal or not.
@@ -240,7 +240,7 @@ def progress_bars(
 
 
 def _lines() -> Report:
-    """What prints steps as lines."""
+    """A function that prints steps as lines."""
     printed: dict[str, float] = {}
 
     def report(step: str, done: int, total: int, remark: str) -> None:

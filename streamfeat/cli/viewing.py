@@ -89,7 +89,7 @@ def view(
     """Events as they happen, in the browser: of a recording or of live topics. No model is needed.
 
     With a model: bins, active volumes, features and latency, too; with a classifier its scores. A recording
-    begins when somebody looks, and can be paused and sought in until Ctrl-C.
+    begins when the page is opened, and can be paused and sought in until Ctrl-C.
     """
     from streamfeat.live.network import Network
     from streamfeat.recordings.options import AS_IT_IS

@@ -21,7 +21,7 @@ _RECENT = 65_536
 class Latencies:
     """How long things took, in nanoseconds, to 3 significant digits and up to 60 s.
 
-    All figures come from one HDR histogram, so that whoever decodes it finds the same ones.
+    All figures come from one HDR histogram, so that decoding it gives the same ones.
 
     Args:
         ns: `(n,)` int64; not changed. What is above 60 s counts as 60 s.
@@ -92,7 +92,7 @@ class Latencies:
 class RecentLatencies:
     """How long things took lately, one after the other: the latest 65,536, and up to as many before them.
 
-    A run of any length holds two histograms. One thread adds; any may ask.
+    A run of any length holds two histograms. One thread adds; any thread may ask.
     """
 
     def __init__(self) -> None:

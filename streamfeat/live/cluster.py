@@ -1,8 +1,8 @@
 """The main job on live topics, on the workers of a cluster: each camera on one of them.
 
-Lives here: which cameras there are, what runs on a worker, and what all of them have done together.
-Not here: which worker serves a camera, and what takes over when that dies (`cluster`); zenoh brings the data
-straight to the worker.
+Lives here: which cameras there are, what runs on a worker, and the sum of what all workers have done.
+Not here: which worker serves a camera, and which takes over when that dies (`work.services`). zenoh brings
+the data straight to the worker.
 """
 
 import contextlib
@@ -38,9 +38,9 @@ class ServedCamera:
         starts: how often a worker has begun to serve it.
         past: counts of the workers before.
         now: counts of this one, a quarter of a second old at most.
-        missed: packets that were published between the last that a dead worker told of and the first that the
-            next one heard; some of them the dead one may have read without telling. One that goes on from a
-            state counts them as lost.
+        missed: packets published between the last that a dead worker told of and the first that the next one
+            heard; the dead one may have read some of them without telling. A worker that goes on from a state
+            counts them as lost.
         first_unheard: packets that were published before the first worker heard any.
     """
 
@@ -69,7 +69,7 @@ class ServedCamera:
                 self._close_gap(is_new=not before.get("packets"))
 
     def _close_gap(self, *, is_new: bool) -> None:
-        """Count what nobody has, when a worker hears its first packet."""
+        """Count the packets that no worker has, when one hears its first packet."""
         gap = _reached(self.now) - self._known()
         if not is_new:
             # Since its state was kept, the worker before has read what this one takes for lost.
@@ -220,7 +220,7 @@ def _serve(
     options: dict[str, Any],
     state: Path | None,
 ) -> dict[str, Any]:
-    """Listen on one topic on a worker, until nobody wants it any more; what it has done."""
+    """Listen on one topic on a worker until the service ends, and return what was done."""
     with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
         given: dict[str, Any] = {**options}
         for argument, (name, content) in files.items():
@@ -238,10 +238,10 @@ def _serve(
 
 
 class _Telling:
-    """Tells what a job has done so far, and stops it when nobody wants it; a context manager."""
+    """Tells what a job has done so far, and stops it when its service ends; a context manager."""
 
     def __init__(self, service: Service, job: ListenJob) -> None:
-        self._errand, self._job = service, job
+        self._service, self._job = service, job
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="telling", daemon=True)
 
@@ -257,7 +257,7 @@ class _Telling:
 
     def _run(self) -> None:
         while not self._over.wait(_TOLD_EVERY_S):
-            if not self._errand.is_wanted():
+            if not self._service.is_wanted():
                 self._job.stop()
                 return
-            self._errand.tell(self._job.result())
+            self._service.tell(self._job.result())

@@ -1,7 +1,7 @@
-"""How a live job is doing: counts for people and for Prometheus.
+"""Figures of a live job: counts for people and for Prometheus.
 
-Lives here: latencies, one view of everything that is counted, and serving it.
-Not here: counting itself, which each part does for its own work.
+Lives here: recent latencies, one list of everything that is counted, and serving it over HTTP.
+Not here: counting, which each part does for its own work.
 """
 
 import time
@@ -32,7 +32,7 @@ _PERCENTILES = 50, 99
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """How one camera is doing.
+    """Figures of one camera.
 
     Attributes:
         topic: of the camera.
@@ -55,13 +55,13 @@ class Health:
     """Counts of one live job; a processor too, which times the cameras it wraps.
 
     Args:
-        cameras: what is done with events.
-        intake: what was received.
-        inbox: what waits.
-        warnings: what was refused.
+        cameras: that process the items.
+        intake: that received them.
+        inbox: where messages wait.
+        warnings: that were given.
 
     Attributes:
-        queues: tells how full the queues of the pipeline are.
+        queues: gives the depth of the pipeline's queues.
     """
 
     def __init__(self, cameras: Cameras, intake: Intake, inbox: Inbox, warnings: Warnings) -> None:
@@ -213,7 +213,7 @@ class Health:
         yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
 
     def drops(self) -> dict[str, int]:
-        """What was not used, or was strange, by reason: packets, and (`late`, `rejected`) events."""
+        """Packets, and (`late`, `rejected`) events, that were not used or are worth a warning, by reason."""
         stats, delivery = self._cameras.stats(), self.delivery()
         return {
             "lost": delivery.lost,
@@ -251,7 +251,7 @@ class Health:
         return result
 
     def reasons(self) -> Counter[str]:
-        """What was refused or strange, by reason."""
+        """Messages that were refused, and events worth a warning, by reason."""
         return Counter(dict(list(self._warnings.counts.items())))
 
 
@@ -259,7 +259,7 @@ def parse_address(text: str) -> tuple[str, int]:
     """Read `HOST:PORT`.
 
     Raises:
-        InputError: the text is none.
+        InputError: the text is something else.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:

@@ -1,7 +1,7 @@
-"""The main job on live topics: events in, features and predictions out, until somebody stops it.
+"""The main job on live topics: events in, features and predictions out, until it is stopped.
 
 Lives here: putting together what listening needs, and ending well.
-Not here: each of the parts.
+Not here: the parts themselves.
 """
 
 import math
@@ -46,9 +46,9 @@ from streamfeat.stream.warming import warm_up
 __all__ = ["ListenJob", "listen"]
 
 PATIENCE_S = 0.05
-"""A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
+"""Behind a packet that has waited longer, a session emits as `auto` does, until it has caught up."""
 MAX_DELAY_S = 1.0
-"""Where even feeding cannot keep up, packets are dropped rather than being ever further behind."""
+"""Where even feeding cannot keep up, packets are dropped, so that the delay does not grow."""
 _DRAWN_A_SECOND = 4
 
 
@@ -67,14 +67,14 @@ class ListenJob:
         publish: put features and predictions on the network, beside the events.
         metrics: `HOST:PORT` to serve Prometheus metrics on.
         silence_s: how long a camera must be silent before its time goes on without it.
-        patience_s: how long packets may wait before readings are left out for them.
+        patience_s: how long packets may wait before emissions are left out for them.
         max_delay_s: how long packets may wait before the oldest are dropped.
         state: file to keep what is needed to go on after a crash; gone on from, if it exists.
         state_every_s: how often it is written.
-        shard: the share of the cameras to serve; all without it.
-        announced: serve those only that announce themselves; what others publish is not asked for.
-        joins_late: readings are incomplete until a window has passed, if packets were published before; as
-            of one who goes on with the cameras of another.
+        shard: the share of the cameras to serve; all of them without it.
+        announced: serve only cameras that announce themselves, and ask for nothing else.
+        joins_late: emissions are incomplete until a window has passed, if packets were published before;
+            for a job that goes on with the cameras of another.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
         tap: what items pass through before anything is computed from them.
@@ -214,7 +214,7 @@ class ListenJob:
         return self.health.result() | {"interrupted": self.interrupted}
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         return self.health.drops()
 
     def session_stats(self) -> SessionStats:

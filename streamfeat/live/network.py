@@ -205,7 +205,7 @@ class TopicWatch:
 
 
 def is_of(wanted: zenoh.KeyExpr, topic: str) -> bool:
-    """Whether a token is of a topic that is wanted: ROS 2 tells of all, and nobody's token is a wildcard."""
+    """Whether a token is of a topic that is wanted, for ROS 2 tells of all; tokens have no wildcards."""
     try:
         return "*" not in topic and wanted.includes(zenoh.KeyExpr(topic.strip("/")))
     except zenoh.ZError:
@@ -214,7 +214,7 @@ def is_of(wanted: zenoh.KeyExpr, topic: str) -> bool:
 
 @dataclass(frozen=True, slots=True, order=True)
 class FoundTopic:
-    """A topic that somebody publishes events on.
+    """A topic with publishers of events.
 
     Attributes:
         name: key, or ROS 2 topic.
@@ -230,7 +230,7 @@ class FoundTopic:
 
 
 def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic]:
-    """Listen to who publishes events; publishers of plain keys are found if they declare a token.
+    """Find topics that events are published on; those of plain keys if their publishers declare a token.
 
     Args:
         session: open.

@@ -1,7 +1,7 @@
 """Recordings as live cameras.
 
 Lives here: one or several recordings played to topics, at their pace or another, once or for ever.
-Not here: reading (`recording`), pacing (`pipeline`), the network (`network`, `publisher`).
+Not here: reading (`recordings`), pacing (`stream.pacing`), the network (`network`, `publisher`).
 """
 
 import time
@@ -35,10 +35,10 @@ class PublishJob:
 
     Args:
         sources: recordings, with the topic of each.
-        names: how topics are called.
+        names: plain or ROS 2.
         topic: event topic of the recordings, where they have several.
         reading: how to read the recordings.
-        speed: stream seconds for each second of the clock; None for as fast as readers take it.
+        speed: stream seconds for each second of the clock; None for as fast as subscribers take them.
         loop: start again at the end, with times that go on.
         encoding: of the payloads.
         wait_s: how long to wait for a subscriber.
@@ -90,7 +90,7 @@ class PublishJob:
             report: called with (step, done, of how many, remark) as packets and labels are read, from a
                 thread.
         """
-        # Only those without a pace of their own can wait for readers; a camera cannot.
+        # Only a publisher without a pace can wait for subscribers; a camera cannot.
         options = {"block": self._speed is None, "reliable": self._network.reliable}
         with self._network.open() as session, ExitStack() as recordings:
             self._sinks = open_sinks(

@@ -1,10 +1,10 @@
 """Live topics to a recording that survives a crash.
 
-Lives here: which messages are recorded, and how often they are made safe.
-Not here: writing (`recorder`), the network (`network`).
+Lives here: which messages are recorded, and how often chunks are closed.
+Not here: writing (`recordings.writer`), the network (`network`, `subscription`).
 
 Messages are written as they came. Every `chunk_s` seconds what was written is closed as a chunk and handed to
-the operating system, so a process that is killed at any byte loses what came after that, and nothing before.
+the operating system, so a process that is killed at any byte loses only messages that came after that.
 """
 
 import time
@@ -38,7 +38,7 @@ _MESSAGES = {kind.SCHEMA_NAME: kind for kind in (EventPacket, EventArray, LabelM
 
 @dataclass(frozen=True, slots=True)
 class _Flush:
-    """Time to make safe what was written."""
+    """Close a chunk here and hand it to the operating system."""
 
 
 class RecordJob:
@@ -153,7 +153,7 @@ class RecordJob:
                 yield None
 
     def _is_wanted(self, message: RawMessage) -> bool:
-        """Whether it is a message of ours that did not come before; says what is missing."""
+        """Whether a message is of a known type and new; warns of those that are missing before it."""
         kind = _MESSAGES.get(message.schema)
         if message.problem or kind is None:
             self._warnings.add(message.problem or "unknown type", message.topic, message.schema[:80])

@@ -1,4 +1,4 @@
-"""How a live job is doing, as one table for people.
+"""Figures of a live job, as one table for people.
 
 Lives here: laying out what is counted.
 Not here: counting (`health`), and when the table is drawn anew (`listen`).

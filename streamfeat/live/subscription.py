@@ -33,8 +33,8 @@ _HISTORY = 256
 class Subscription:
     """Puts what arrives on some names into an inbox; a context manager.
 
-    Callbacks run in zenoh's own threads and do as little as they can. Our own outputs are not taken for
-    events, whatever wildcard matches them.
+    Callbacks run in zenoh's own threads and do as little as they can. Features and predictions are not taken
+    for events, whatever wildcard matches them.
 
     Args:
         session: open; not closed here.
@@ -44,8 +44,8 @@ class Subscription:
             with publishers that do the same.
         shard: the cameras to hear; all others are left out, and their packets counted, before their bytes
             are copied.
-        announced: hear those only that announce themselves by a token, each by a subscription of its own, so
-            that packets of other shards do not come over the network at all. A wildcard hears everybody.
+        announced: hear only cameras that announce themselves by a token, each by a subscription of its own,
+            so that packets of other shards do not come over the network, as they do with a wildcard.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Subscription:
             self._wanted = zenoh.KeyExpr(names.expression.strip("/"))
             if announced:
                 self._follower.start()
-            # First the tokens: who leaves was there before.
+            # First the tokens: a publisher that leaves must have been seen before.
             self._open.append(
                 session.liveliness().declare_subscriber(
                     names.tokens, Callback(self._on_token, indirect=False), history=True
@@ -112,12 +112,12 @@ class Subscription:
             self._follower.join()
 
     def _follow(self) -> None:
-        """Subscribe to each topic that is announced; who left may have packets under way."""
+        """Subscribe to each topic that is announced; a publisher that left may have packets under way."""
         followed: dict[str, list[Any]] = {}
         while (topic := self._come.get()) is not None:
             if topic in followed:
                 continue
-            with suppress(zenoh.ZError, InputError):  # no topic: somebody made that token up
+            with suppress(zenoh.ZError, InputError):  # no topic: the token was made up
                 names = self._names.only(topic).subscriptions
                 followed[topic] = [self._subscribe(expression) for expression in names]
             gone = [one for one in followed if one not in self._tokens]

@@ -89,7 +89,7 @@ class EmitPolicy:
         """Read `event`, `1000ev`, `10ms` (also `500us`, `2s`) or `auto`.
 
         Raises:
-            InputError: the text is none of these.
+            InputError: the text is something else.
         """
         if text == "auto":
             return cls("auto")

@@ -1,4 +1,4 @@
-"""Emissions as an asynchronous iterator, for programs of other people.
+"""Emissions as an asynchronous iterator, for any asyncio program.
 
 Lives here: `EmissionStream`, which runs a job's pipeline in a task of the running loop and hands over what
 comes out, one emission at a time.
@@ -105,7 +105,7 @@ class EmissionStream:
     async def __aexit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close; an error that nobody has seen yet is raised, unless the block ends with another."""
+        """Close; an error that has not come out yet is raised, unless the block ends with another."""
         try:
             await self.aclose()
         except Exception:
@@ -142,7 +142,7 @@ class EmissionStream:
         """Cancel what is under way and wait until everything is closed; once more does nothing.
 
         Raises:
-            Exception: that of the pipeline, where it has failed and nobody has seen it.
+            Exception: that of the pipeline, where it has failed and the error has not come out yet.
         """
         self._is_over = True
         self._taken.clear()

@@ -159,7 +159,7 @@ class ReplayJob:
         return self._played.losses if self._played else Losses()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         stats = self._session.stats()
         return {
             "dropped": 0,

@@ -1,7 +1,7 @@
 """SIGINT and SIGTERM for programs that run pipelines and nothing else.
 
 Lives here: running pipelines in an event loop of their own until a signal stops them.
-Not here: the pipeline itself, which knows nothing of signals and runs in anybody's loop (`pipeline`).
+Not here: the pipeline itself, which knows nothing of signals and runs in any loop (`pipeline`).
 """
 
 import asyncio
@@ -37,7 +37,7 @@ def run_until_interrupted(
     """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
 
     Args:
-        pipelines: none of which has run.
+        pipelines: not run before.
         interrupt: what a signal does; if not given, it stops every pipeline.
 
     Returns:
