@@ -15,7 +15,9 @@ import tiny
 import streamfeat as sf
 from streamfeat.stream import emission_stream
 from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.replay import ReplayJob
 from streamfeat.stream.session import Session
 
 MODEL = tiny.encoder(k=3)
@@ -43,6 +45,17 @@ def same(one, two):
         assert (a.t_us, a.n_events, a.sample, a.final) == (b.t_us, b.n_events, b.sample, b.final)
         assert np.array_equal(a.features, b.features)
         assert np.array_equal(a.scores, b.scores)
+
+
+class Kept:
+    def __init__(self):
+        self.emissions = []
+
+    def write(self, emissions):
+        self.emissions += emissions
+
+    def close(self, *, failed):
+        pass
 
 
 async def collected(stream):
@@ -84,6 +97,29 @@ def test_a_replay_gives_the_emissions_of_a_plain_loop(files, policy, speed):
     assert stats.session.samples == 8
     assert stats.drops == {"dropped": 0, "late": 0, "rejected": 0, "lost": 0}
     assert stats.waiting == 0
+
+
+def test_they_are_those_of_the_command(files):
+    kept = Kept()
+    parts = files / "in.mcap", files / "model", files / "classifier"
+    ReplayJob(*parts, emit="1ms").run(Outputs(more=kept))
+    same(asyncio.run(collected(sf.replay(*parts, emit="1ms"))), kept.emissions)
+    assert len(kept.emissions) > 400
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 300])
+def test_nothing_is_left_when_the_iterator_is_closed(files, after):
+    async def leave():
+        async with contextlib.aclosing(aiter(sf.replay(files / "in.mcap", MODEL, emit="event"))) as emissions:
+            n = 0
+            async for _ in emissions:
+                n += 1
+                if n > after:
+                    break
+        assert left_over()[0] == []
+
+    with nothing_leaks():
+        asyncio.run(leave())
 
 
 def test_what_is_open_and_loaded_already_is_taken_as_it_is(files):
@@ -275,7 +311,9 @@ def test_a_stream_cancelled_at_any_await_leaves_nothing(way, idle):
 
 def test_a_replay_cancelled_at_any_await_leaves_no_file_open(files):
     async def read():
-        async for _ in sf.replay(files / "in.mcap", files / "model", files / "classifier", emit="event"):
+        async for _ in sf.replay(
+            files / "in.mcap", files / "model", files / "classifier", emit="event", speed=1.0
+        ):
             pass
 
     async def main():

@@ -50,7 +50,7 @@ def test_emissions_of_live_topics_have_the_bits_of_the_offline_path(files):
             assert is_enough.wait(60)
 
     async def main():
-        options = {"port": port, "max_delay_s": 1e9}
+        options = {"port": port, "max_delay_s": 1e9, "emit": "10ms"}
         async with sf.listen("cam/*/events", files / "model", files / "classifier", **options) as stream:
             publishing = asyncio.create_task(asyncio.to_thread(publish))
             found = []

@@ -270,7 +270,7 @@ def listen(
     model: ModelSource,
     classifier: ClassifierSource | None = None,
     *,
-    emit: str | EmitPolicy = "10ms",
+    emit: str | EmitPolicy = "auto",
     ros_domain: int = 0,
     learn_online: bool = False,
     max_delay_s: float = MAX_DELAY_S,

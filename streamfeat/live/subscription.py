@@ -7,7 +7,7 @@ Not here: sessions (`network`), names (`names`), what messages mean (`intake`).
 import threading
 import time
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Full, Queue
 from types import TracebackType
 from typing import Any, Self
 
@@ -28,6 +28,10 @@ __all__ = ["Subscription"]
 
 _HISTORY = 256
 """Packets that a reliable subscriber asks a publisher for when it joins late."""
+_MAX_TOKENS = 1 << 14
+"""Publishers that are known at a time; announcements of further ones are refused and counted."""
+_MAX_COME = 1 << 10
+"""Announced topics that may wait for a subscription."""
 
 
 class Subscription:
@@ -68,9 +72,10 @@ class Subscription:
         self._shard = shard
         self._session, self._reliable = session, reliable
         # zenoh may not be asked for a subscription from within its own callbacks.
-        self._come: SimpleQueue[str | None] = SimpleQueue()
+        self._come: Queue[str | None] = Queue(_MAX_COME)
         self._follower = threading.Thread(target=self._follow, name="streamfeat follower", daemon=True)
         self._tokens: dict[str, set[str]] = {}
+        self._n_tokens = 0
         self._open: list[object] = []
         try:
             wanted = [] if announced else names.subscriptions
@@ -178,15 +183,29 @@ class Subscription:
         if not topic or (self._shard and not self._shard.has(topic)):
             return
         # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
-        tokens = self._tokens.setdefault(topic, set())
+        token, tokens = str(sample.key_expr), self._tokens.get(topic, set())
         if sample.kind == zenoh.SampleKind.PUT:
-            tokens.add(str(sample.key_expr))
+            if token in tokens:
+                return
+            if self._n_tokens >= _MAX_TOKENS:
+                self._inbox.refuse()
+                return
+            self._tokens.setdefault(topic, tokens).add(token)
+            self._n_tokens += 1
             if len(tokens) == 1:
                 self._inbox.put(Announcement(topic, here=True))
                 if self._follower.is_alive() and is_of(self._wanted, topic):
-                    self._come.put(topic)
-            return
-        tokens.discard(str(sample.key_expr))
-        if not tokens:
-            del self._tokens[topic]
-            self._inbox.put(Announcement(topic, here=False))
+                    self._ask_for(topic)
+        elif token in tokens:
+            tokens.discard(token)
+            self._n_tokens -= 1
+            if not tokens:
+                del self._tokens[topic]
+                self._inbox.put(Announcement(topic, here=False))
+
+    def _ask_for(self, topic: str) -> None:
+        """Have the follower subscribe to a topic, unless too many wait for that already."""
+        try:
+            self._come.put_nowait(topic)
+        except Full:
+            self._inbox.refuse()
