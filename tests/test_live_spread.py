@@ -76,7 +76,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
     port, keys = free_port(), [f"robot/{i}/events" for i in range(4)]
     state = tmp_path / "state" if keeps_state else None
     lines = []
-    options = {"port": port, "emit": "10ms", "state": state, "say": lines.append}
+    options = {"network": Network(port=port), "emit": "10ms", "state": state, "say": lines.append}
     job = ClusterListen(PlainNames("robot/*/events"), two, model, **options)
     until(lambda: len(two.processes()) == 2, "two workers")
     with open_session(port=port) as session, running(job):

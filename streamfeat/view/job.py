@@ -1,7 +1,7 @@
-"""A view: a recording or live topics that somebody looks at.
+"""A view: a recording or live topics as pictures.
 
-Lives here: putting boards, page and sink beside what is looked at; waiting for somebody to look.
-Not here: what is looked at (`sources`, `live.listen`), what is shown (`sink`).
+Lives here: putting boards, page and sink beside a source; waiting for the first viewer.
+Not here: sources (`sources`, `live.listen`), what is shown (`sink`).
 """
 
 import os
@@ -149,7 +149,7 @@ class View:
     def run(self) -> None:
         """Show the source to its end or to SIGINT.
 
-        A recording that is served begins when somebody looks, and can be sought in until SIGINT.
+        A recording that is served begins with the first viewer, and can be sought in until SIGINT.
 
         Raises:
             InputError: an output, a port or the network cannot be used.
@@ -160,7 +160,7 @@ class View:
                 if self._is_recording and self._encoder:
                     warm_up(self._encoder, self._policy)
                 if self._is_recording and self._is_served:
-                    self._wait_for(self._looked, "waiting for somebody to look; Ctrl-C ends")
+                    self._wait_for(self._looked, "waiting for the first viewer; Ctrl-C ends")
             if self._stopped.is_set():
                 return
             if isinstance(self._job, ListenJob):
@@ -216,7 +216,7 @@ class View:
             opened.callback(live.close)
             self._boards.append(live)
             if self._is_recording:
-                live.announce(prefix_of(""))  # somebody who looks has something to subscribe to
+                live.announce(prefix_of(""))  # so that a viewer has something to subscribe to
             self._say(f"Foxglove: ws://127.0.0.1:{live.port}")
         if self._web_port is not None:
             server = PageServer(page, self._web_port, on_viewer=self._looked.set, on_asked=self._asked)

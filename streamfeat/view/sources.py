@@ -1,4 +1,4 @@
-"""What a view looks at: a recording that somebody plays, or live topics; with features or without.
+"""Sources of a view: a recording that is played, or live topics; with features or without.
 
 Lives here: `PlayJob` and `WatchJob`, which bring items through a tap to sessions, if there are any.
 Not here: pictures and boards (`sink`), the player itself (`player`), listening with features (`live.listen`).
@@ -55,7 +55,7 @@ class NoFeatures:
 
 
 class PlayJob:
-    """A recording that is played, for somebody who looks on or for a file.
+    """A recording that is played, for viewers or into a file.
 
     Args:
         source: the recording.
@@ -64,7 +64,7 @@ class PlayJob:
         emit: when to read.
         speed: played seconds for each of the clock; None for as fast as possible.
         loop: start again at the end.
-        stays: stay at the end, for somebody may seek.
+        stays: stay at the end, because a viewer may seek.
         split: play samples of this split only.
         topic: event topic, where there are several.
         reading: how to read what is no MCAP, and what to take out.
@@ -139,7 +139,7 @@ class PlayJob:
         self.player.stop()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         lost = sum(list(self.player.losses.counts.values()))
         if self._session is None:
             return {"lost": lost}
@@ -195,7 +195,7 @@ class WatchJob:
         self._inbox.close()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         delivery = self._intake.delivery()
         return {"lost": delivery.lost, "dropped": self._inbox.dropped, "duplicates": delivery.duplicates}
 

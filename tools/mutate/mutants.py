@@ -152,7 +152,7 @@ MUTANTS = [
         "stream/state.py",
         "        t_us = max(t_us, self.silent_us)\n",
         "",
-        "tests/test_state.py",
+        SESSION,
     ),
     Mutant(
         "another policy goes on with what was due under the one before",
