@@ -19,6 +19,7 @@ from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.replay import ReplayJob
 from streamfeat.stream.session import Session
+from streamfeat.stream.threads import Threads
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL, ["cat", "dog", "owl"])
@@ -295,7 +296,7 @@ def test_a_stream_cancelled_at_any_await_leaves_nothing(way, idle):
                 await asyncio.sleep(0)
 
     async def main():
-        for turns in [*range(40), *range(40, 2000, 487)]:
+        for turns in [*range(24), *range(24, 1200, 293)]:
             assert not await cancelled_after(turns, read)
             tasks = asyncio.all_tasks() - {asyncio.current_task()}
             while any(t.get_name() == "streamfeat emissions" for t in tasks):
@@ -317,7 +318,7 @@ def test_a_replay_cancelled_at_any_await_leaves_no_file_open(files):
             pass
 
     async def main():
-        for turns in [*range(30), *range(30, 1500, 317)]:
+        for turns in [*range(16), *range(16, 1200, 293)]:
             before = left_over()
             await cancelled_after(turns, read)
             assert left_over() == before
@@ -352,6 +353,32 @@ def test_cancelled_again_while_it_is_closing(files):
         with pytest.raises(asyncio.CancelledError):
             await task
         assert not job.is_open
+
+    with nothing_leaks():
+        asyncio.run(main())
+
+
+def test_a_cancelled_call_is_waited_for_without_blocking_the_loop():
+    began, held = threading.Event(), threading.Event()
+
+    def call():
+        began.set()
+        assert held.wait(30)
+
+    async def main():
+        with Threads(1) as threads:
+            task = asyncio.create_task(threads.run(call))
+            while not began.is_set():
+                await asyncio.sleep(0)
+            for _ in range(3):
+                task.cancel()
+                for _ in range(30):
+                    await asyncio.sleep(0)
+                assert not task.done()
+                assert threads.cancelled
+            held.set()
+            with pytest.raises(asyncio.CancelledError):
+                await task
 
     with nothing_leaks():
         asyncio.run(main())
