@@ -153,11 +153,8 @@ class Session:
 
     def _process_packet(self, packet: Packet) -> Iterator[Emission]:
         state = self._state
-        if state.starts_epoch(packet.epoch):
-            yield from self._finish_sample()
-            state.enter_epoch(packet.epoch)
-            self._restart()
-        state.enter_epoch(packet.epoch)
+        if packet.epoch != state.epoch:
+            yield from self._enter_epoch(packet.epoch)
         state.lost |= packet.lost > 0
         self._log_time_ns, self._source_ns = packet.log_time_ns, packet.source_ns
         events = packet.events
@@ -194,6 +191,14 @@ class Session:
             yield self._emit(self._engine, self._state.last_us + 1)
         if self.learner:
             self.learner.flush()
+
+    def _enter_epoch(self, epoch: int) -> Iterator[Emission]:
+        if self._state.epoch is None:
+            self._state.epoch = epoch
+            return
+        yield from self._finish_sample()
+        self._state.begin_epoch(epoch)
+        self._restart()
 
     def _restart(self) -> None:
         if self._engine:

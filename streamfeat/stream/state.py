@@ -120,17 +120,10 @@ class SessionState:
         """Whether labelled samples come with this stream and none is open: silence tells nothing then."""
         return self.seen_label and self.sample is None
 
-    def starts_epoch(self, epoch: int) -> bool:
-        """Whether a packet is of another epoch than the one before it."""
-        return self.epoch not in (None, epoch)
-
-    def enter_epoch(self, epoch: int) -> None:
-        """Go on with the packets of an epoch; another one than before starts with an empty window, and
-        nothing tells what is missing before it.
-        """
-        if self.starts_epoch(epoch):
-            self.begin(0)
-            self.lost = True
+    def begin_epoch(self, epoch: int) -> None:
+        """Start anew with the camera's clock: an empty window, with nothing known of what came before."""
+        self.begin(0)
+        self.lost = True
         self.epoch = epoch
 
     def place(self, t: NDArray[np.int64], valid: NDArray[np.bool_], window_us: int) -> NDArray[np.int64]:

@@ -136,8 +136,8 @@ MUTANTS = [
     Mutant(
         "a new epoch keeps the window",
         "stream/session.py",
-        "            state.enter_epoch(packet.epoch)\n            self._restart()\n",
-        "            state.enter_epoch(packet.epoch)\n",
+        "        self._state.begin_epoch(epoch)\n        self._restart()\n",
+        "        self._state.begin_epoch(epoch)\n",
         SESSION,
     ),
     Mutant(
