@@ -95,19 +95,17 @@ class Network:
                     f"{self.config}: zenoh cannot use this configuration: {first_line(error)}"
                 ) from None
         meeting = f"tcp/127.0.0.1:{self.port}"
-        # Twice, for the session that holds the port may leave while this one connects.
-        for _ in range(2):
-            with suppress(zenoh.ZError):
-                return zenoh.open(_loopback([meeting], []))
-            try:
-                session = zenoh.open(_loopback(["tcp/127.0.0.1:0"], [meeting]))
-            except zenoh.ZError as error:
-                raise InputError(
-                    f"zenoh cannot open a session on this machine: {first_line(error)}"
-                ) from None
-            if _has_met(session):
-                return session
-            session.close()  # type: ignore[no-untyped-call]
+        with suppress(zenoh.ZError):
+            return zenoh.open(_loopback([meeting], []))
+        try:
+            session = zenoh.open(_loopback(["tcp/127.0.0.1:0"], [meeting]))
+        except zenoh.ZError as error:
+            raise InputError(f"zenoh cannot open a session here: {first_line(error)}") from None
+        if _has_met(session):
+            return session
+        session.close()  # type: ignore[no-untyped-call]
+        with suppress(zenoh.ZError):  # the session that held the port may have left meanwhile
+            return zenoh.open(_loopback([meeting], []))
         raise InputError(
             f"port {self.port} of this machine is held by a program that does not speak zenoh; give --port "
             "another one, here and wherever these topics are published or heard"
