@@ -21,14 +21,14 @@ ROOMS = {
     "kernels": {"events"},
     "files": {"errors"},
     "work": {"errors"},
-    "engine": {"errors", "events", "files", "kernels"},
+    "report": {"errors", "files"},
+    "engine": {"errors", "events", "files", "kernels", "report"},
     "messages": {"errors", "events", "files", "kernels"},
     "denoise": {"errors", "events", "kernels", "messages"},
     "simulate": {"events"},
     "camera_files": {"errors", "events", "files", "messages"},
-    "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages"},
-    "report": {"errors", "files"},
-    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "work"},
+    "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
+    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
     "convert": {
         "camera_files",
@@ -252,6 +252,8 @@ def test_what_a_module_offers_exists_and_is_described(name):
 
 def test_the_package_offers_about_twenty_names():
     assert len(streamfeat.__all__) <= 22
+    assert set(streamfeat.__all__) == {*streamfeat._HOMES, "__version__"}
+    assert set(dir(streamfeat)) >= set(streamfeat.__all__)
 
 
 PAGES = [

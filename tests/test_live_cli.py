@@ -16,7 +16,7 @@ from streamfeat.cli import main
 from streamfeat.errors import InputError
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.live.network import FoundTopic, find_topics, open_session
+from streamfeat.live.network import FoundTopic, Network, find_topics, open_session
 from streamfeat.live.record import RecordJob
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import recover
@@ -104,7 +104,7 @@ def test_record_survives_a_kill_with_all_but_the_last_chunk(files, tmp_path):
         process.wait()
     assert not target.exists()
     with pytest.raises(InputError, match="streamfeat recover"):
-        RecordJob(PlainNames("cam/*/events"), target, port=port).run()
+        RecordJob(PlainNames("cam/*/events"), target, network=Network(port=port)).run()
     recover(part, target)
     with open_recording(target) as recording:
         got = np.concatenate(list(recording))
@@ -127,7 +127,7 @@ def test_a_silent_recording_is_safe_too(tmp_path):
     """Chunks are closed by the clock, not by the next message."""
     port, target, copy = free_port(), tmp_path / "drive.mcap", tmp_path / "copy.mcap"
     part = tmp_path / "drive.mcap.part"
-    job = RecordJob(PlainNames("cam/*/events"), target, port=port, chunk_s=0.05)
+    job = RecordJob(PlainNames("cam/*/events"), target, network=Network(port=port), chunk_s=0.05)
     with (
         plain_session(port, listen=True) as net,
         running(job),
@@ -142,7 +142,7 @@ def test_a_silent_recording_is_safe_too(tmp_path):
 
 def test_publish_until_interrupted(files):
     port = free_port()
-    job = ListenJob(PlainNames("cam/*/events"), files / "model", port=port)
+    job = ListenJob(PlainNames("cam/*/events"), files / "model", network=Network(port=port))
     with running(job):
         words = ["publish", files / "labelled.mcap", "cam/a/events", "--loop", "--speed", "5"]
         with started(*words, "--port", port, "--wait", "60", "--json") as publisher:

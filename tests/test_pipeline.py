@@ -16,9 +16,11 @@ from streamfeat.errors import InputError
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
-from streamfeat.stream.replay import ReplayJob
+from streamfeat.stream.outputs import Outputs
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.replay import ReplayJob, parse_speed
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, TerminalSink
 
 MODEL = tiny.encoder(k=3)
@@ -457,12 +459,11 @@ def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
     (tmp_path / "out.mcap.part").write_bytes(b"left over")
     job = ReplayJob(digits, tmp_path / "model")
     with pytest.raises(InputError, match="left by a writer"):
-        job.run(recording_out=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl")
+        job.run(Outputs(recording=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "out.mcap.part"]
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", "", "1e9"])
-def test_bad_speeds_are_refused(tmp_path, digits, text):
-    MODEL.save(tmp_path / "model")
+def test_bad_speeds_are_refused(text):
     with pytest.raises(InputError, match="--speed"):
-        ReplayJob(digits, tmp_path / "model", speed=text)
+        parse_speed(text)

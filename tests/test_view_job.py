@@ -22,6 +22,7 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 from streamfeat.cli import app
 from streamfeat.errors import InputError
 from streamfeat.live.names import PlainNames, RosNames
+from streamfeat.live.network import Network
 from streamfeat.live.publish import PublishJob
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
@@ -192,7 +193,7 @@ def test_live_topics_are_shown_and_not_answered(files):
         emit="10ms",
         say=lines.append,
         foxglove_port=0,
-        port=port,
+        network=Network(port=port),
     )
     with shown(view), plain_session(port) as session:
         until(lambda: lines)
@@ -218,10 +219,14 @@ def test_a_ros_camera_is_shown(files):
         rate=1000,
         say=lines.append,
         foxglove_port=0,
-        port=port,
+        network=Network(port=port),
     )
     camera = PublishJob(
-        [(files / "samples.mcap", "/event_camera/events")], names, speed=4.0, port=port, wait_s=30
+        [(files / "samples.mcap", "/event_camera/events")],
+        names,
+        speed=4.0,
+        network=Network(port=port),
+        wait_s=30,
     )
     with shown(view):
         until(lambda: lines)

@@ -23,8 +23,9 @@ from streamfeat.evaluate.run import StateFile
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink
 
 ROOT = Path(__file__).parents[1]

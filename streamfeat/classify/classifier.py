@@ -19,6 +19,7 @@ from streamfeat.classify.folds import assign_folds, check_labels
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
+from streamfeat.report.shown import Shown
 
 __all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
 
@@ -55,8 +56,8 @@ def _roots(features: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     return np.copysign(size, features, out=size), np.where(length > 0, length, np.float32(1))
 
 
-@dataclass(frozen=True, slots=True)
-class Classifier:
+@dataclass(frozen=True, slots=True, repr=False)
+class Classifier(Shown):
     """A frozen linear classifier over the features of one encoder.
 
     Attributes:

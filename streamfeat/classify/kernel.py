@@ -19,6 +19,7 @@ from streamfeat.classify.classifier import Classifier, normalise_features
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
+from streamfeat.report.shown import Shown
 
 __all__ = ["MOST_POINTS", "KernelClassifier", "load_classifier", "train_kernel_classifier"]
 
@@ -34,8 +35,8 @@ _FOR_MEDIAN = 2048
 """Rows whose distances the width of the kernel is told from."""
 
 
-@dataclass(frozen=True, slots=True)
-class KernelClassifier:
+@dataclass(frozen=True, slots=True, repr=False)
+class KernelClassifier(Shown):
     """Kernel ridge regression onto the classes: `score = k(u) . dual`, `k_i = exp(-gamma |u - p_i|^2)`.
 
     `u` are the normalised features, centred and projected on the principal axes of those in training.

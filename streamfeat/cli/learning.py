@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    completing,
     err,
     print_losses,
     print_result,
@@ -55,7 +56,14 @@ def learn(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
     model: Annotated[Path, typer.Option("--output", "-o", help="Model to write.")],
-    formulation: Annotated[str | None, typer.Option(help="direct or inverse.", show_default="direct")] = None,
+    formulation: Annotated[
+        str | None,
+        typer.Option(
+            help="direct or inverse.",
+            show_default="direct",
+            autocompletion=completing("direct", "inverse"),
+        ),
+    ] = None,
     preset: options.Preset = "default",
     encoding: options.Encoding = None,
     filters: options.Filters = None,

@@ -24,6 +24,7 @@ from streamfeat.cli.program import (
     StepsOption,
     TopicOption,
     app,
+    completing,
     err,
     out,
     progress_bars,
@@ -52,7 +53,11 @@ def latency(
         list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
     ],
     emit: Annotated[
-        list[str], typer.Option(help="When to read features: event, 1000ev, 10ms or auto; may be repeated.")
+        list[str],
+        typer.Option(
+            help="When to emit features: event, 1000ev, 10ms or auto; may be repeated.",
+            autocompletion=completing("event", "1000ev", "10ms", "auto"),
+        ),
     ] = ["event", "10ms", "auto"],  # noqa: B006  (Typer's way; it is never changed)
     look_ahead: Annotated[
         bool, typer.Option(help="Prepare bin boundaries beforehand where every event is followed.")

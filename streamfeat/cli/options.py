@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from streamfeat.cli.program import completing
 from streamfeat.learn.settings import DEFAULTS, PRESETS, preset_with
 
 __all__ = [
@@ -43,10 +44,20 @@ def _shown(name: str) -> str:
     return str((DEFAULTS | PRESETS["default"])[name])
 
 
-Preset = Annotated[str, typer.Option(help=f"Values of all options that are not given: {', '.join(PRESETS)}.")]
+Preset = Annotated[
+    str,
+    typer.Option(
+        help=f"Values of all options that are not given: {', '.join(PRESETS)}.",
+        autocompletion=completing(*PRESETS),
+    ),
+]
 Encoding = Annotated[
     str | None,
-    typer.Option(help="What is pooled: soft, split or triangle.", show_default=_shown("encoding")),
+    typer.Option(
+        help="What is pooled: soft, split or triangle.",
+        show_default=_shown("encoding"),
+        autocompletion=completing("soft", "split", "triangle"),
+    ),
 ]
 Filters = Annotated[
     int | None, typer.Option(help="Number of filters or atoms, K.", show_default=_shown("filters"))
@@ -89,13 +100,19 @@ Threshold = Annotated[
     ),
 ]
 Start = Annotated[
-    str | None, typer.Option(help="Of learning: kmeans or random.", show_default=_shown("start"))
+    str | None,
+    typer.Option(
+        help="Of learning: kmeans or random.",
+        show_default=_shown("start"),
+        autocompletion=completing("kmeans", "random"),
+    ),
 ]
 Rows = Annotated[
     str | None,
     typer.Option(
         help="Length of the filters while they are learned: unit, or free; direct only.",
         show_default=_shown("rows"),
+        autocompletion=completing("unit", "free"),
     ),
 ]
 Conditioning = Annotated[
@@ -128,7 +145,8 @@ Kernel = Annotated[
     str,
     typer.Option(
         help="Of the classifier: linear, or rbf, which is more accurate and takes about a millisecond for an "
-        "emission; --emit event and --learn-online use the linear one beside it."
+        "emission; --emit event and --learn-online use the linear one beside it.",
+        autocompletion=completing("linear", "rbf"),
     ),
 ]
 

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from streamfeat.cli.program import (
+    EmitOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     RecordingArgument,
+    SpeedOption,
     TopicOption,
     VerboseOption,
     app,
@@ -45,8 +47,8 @@ def replay(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
-    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "max",
+    emit: EmitOption = "auto",
+    speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
     ] = None,
@@ -70,7 +72,8 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
-    from streamfeat.stream.replay import ReplayJob
+    from streamfeat.stream.outputs import Outputs
+    from streamfeat.stream.replay import ReplayJob, parse_speed
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -80,7 +83,7 @@ def replay(
         model,
         classifier,
         emit=emit,
-        speed=speed,
+        speed=parse_speed(speed),
         topic=topic,
         reading=reading,
         split=split,
@@ -90,13 +93,15 @@ def replay(
     to_terminal = str(json_lines) == "-"
     with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
         job.run(
-            console=None if quiet or as_json or to_terminal else out,
-            every_sample=verbose,
-            recording_out=output,
-            json_lines=sys.stdout if to_terminal else json_lines,
-            with_features=features,
-            table=table,
-            report=report,
+            Outputs(
+                console=None if quiet or as_json or to_terminal else out,
+                every_sample=verbose,
+                recording=output,
+                json_lines=sys.stdout if to_terminal else json_lines,
+                with_features=features,
+                table=table,
+            ),
+            report,
         )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)

@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from streamfeat.cli.live import ConfigOption, DomainOption, RosOption, names_of
 from streamfeat.cli.program import (
+    EmitOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
@@ -47,7 +48,7 @@ def view(
         Path | None,
         typer.Option("--classifier", "-c", help="Show predictions, too, of this classifier."),
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    emit: EmitOption = "auto",
     web: Annotated[
         bool | None,
         typer.Option("--web/--no-web", help="Serve the page. Served unless there is -o or --foxglove."),
@@ -88,8 +89,9 @@ def view(
     """Events as they happen, in the browser: of a recording or of live topics. No model is needed.
 
     With a model: bins, active volumes, features and latency, too; with a classifier its scores. A recording
-    begins when somebody looks, and can be paused and sought in until Ctrl-C.
+    begins when the page is opened, and can be paused and sought in until Ctrl-C.
     """
+    from streamfeat.live.network import Network
     from streamfeat.recordings.options import AS_IT_IS
     from streamfeat.stream.replay import parse_speed
     from streamfeat.view.job import View, has_display
@@ -116,7 +118,7 @@ def view(
             raise InputError(
                 "--loop, --speed, --split, --topic and what tells how to read are for recordings"
             )
-        options = {"zenoh_config": zenoh_config, "port": zenoh_port, "console": err}
+        options = {"network": Network(zenoh_config, zenoh_port), "console": err}
     job = View(
         recording or names_of(source, ros2, domain),
         model,

@@ -39,6 +39,7 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.planes import complete, look_ahead
 from streamfeat.kernels.update import finish, mark_dirty, read, renew, settle, update
+from streamfeat.report.shown import Shown
 
 __all__ = ["Engine", "EngineStats", "Snapshot", "Spread"]
 
@@ -96,7 +97,7 @@ class Snapshot:
     encoded: NDArray[np.int64]
 
 
-class Engine:
+class Engine(Shown):
     """Turns a stream of events into features, exactly.
 
     Args:

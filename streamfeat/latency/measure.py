@@ -1,7 +1,7 @@
 """One latency report: every model with every emission policy, update and end to end.
 
 Lives here: opening what a report needs, the order of measurements, rows, the result as JSON values.
-Not here: the measurements (`update`, `hop`), how rows look (`picture`, `cli`).
+Not here: the measurements (`update`, `end_to_end`), how rows look (`picture`, `cli`).
 """
 
 import time

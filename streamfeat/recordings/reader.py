@@ -31,6 +31,7 @@ from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
 from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
 from streamfeat.recordings.totals import Totals
+from streamfeat.report.shown import Shown
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -74,7 +75,7 @@ def open_recording(
     return Recording(path, topic, options=options)
 
 
-class Recording:
+class Recording(Shown):
     """A recording of events, read in file order; iterate as often as you like.
 
     `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass

@@ -1,7 +1,7 @@
-"""A view: a recording or live topics that somebody looks at.
+"""A view: a recording or live topics as pictures.
 
-Lives here: putting boards, page and sink beside what is looked at; waiting for somebody to look.
-Not here: what is looked at (`sources`, `live.listen`), what is shown (`sink`).
+Lives here: putting boards, page and sink beside a source; waiting for the first viewer.
+Not here: sources (`sources`, `live.listen`), what is shown (`sink`).
 """
 
 import os
@@ -23,7 +23,8 @@ from streamfeat.files.locations import Location
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.replay import warm_up
+from streamfeat.stream.outputs import Outputs
+from streamfeat.stream.warming import warm_up
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
 from streamfeat.view.page import page
@@ -139,6 +140,7 @@ class View:
                 emit=emit,
                 engine_of=self._engine_of,
                 tap=self._tap.items,
+                publish=False,
                 **options,
             )
         else:
@@ -147,7 +149,7 @@ class View:
     def run(self) -> None:
         """Show the source to its end or to SIGINT.
 
-        A recording that is served begins when somebody looks, and can be sought in until SIGINT.
+        A recording that is served begins with the first viewer, and can be sought in until SIGINT.
 
         Raises:
             InputError: an output, a port or the network cannot be used.
@@ -158,11 +160,11 @@ class View:
                 if self._is_recording and self._encoder:
                     warm_up(self._encoder, self._policy)
                 if self._is_recording and self._is_served:
-                    self._wait_for(self._looked, "waiting for somebody to look; Ctrl-C ends")
+                    self._wait_for(self._looked, "waiting for the first viewer; Ctrl-C ends")
             if self._stopped.is_set():
                 return
             if isinstance(self._job, ListenJob):
-                self._job.run(more=self._sink, publish=False)
+                self._job.run(Outputs(more=self._sink))
             else:
                 self._job.run(self._tap, self._sink)
 
@@ -214,7 +216,7 @@ class View:
             opened.callback(live.close)
             self._boards.append(live)
             if self._is_recording:
-                live.announce(prefix_of(""))  # somebody who looks has something to subscribe to
+                live.announce(prefix_of(""))  # so that a viewer has something to subscribe to
             self._say(f"Foxglove: ws://127.0.0.1:{live.port}")
         if self._web_port is not None:
             server = PageServer(page, self._web_port, on_viewer=self._looked.set, on_asked=self._asked)

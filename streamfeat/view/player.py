@@ -1,4 +1,4 @@
-"""Playing a recording at a pace that somebody steers: pause, step, seek, speed, again from the start.
+"""Playing a recording under control: pause, step, seek, speed, again from the start.
 
 Lives here: `Player`, the items of a recording as they are due; `Timeline`, the event rate over played time.
 Not here: what is done with the items, and the page whose buttons steer them.
@@ -72,7 +72,7 @@ class Player:
         choose: makes the items that are played of those of the recording.
         speed: played seconds for each second of the clock; None for as fast as possible.
         loop: start again at the end.
-        stays: wait at the end until `stop`, for somebody may want to seek.
+        stays: wait at the end until `stop`, because a viewer may seek.
         on_change: called with what the page shows of the player, whenever that changes.
     """
 

@@ -5,7 +5,7 @@ Not here: what is shown (`sink`), what buttons do (`job`), the page itself (`pag
 
 The address holds a token that is made anew for each view. Without it, with another `Host` (a name that was
 bound to this machine from outside) or from a page of another origin, nothing is given. Of each thing that is
-shown a browser gets the latest; what it had no time for is left out, and nobody waits for it.
+shown a browser gets the latest; what it had no time for is left out, and holds up nothing.
 
 A message to the browser is text, `{"camera", "channel", "record"}`, or bytes: the length of a JSON header in
 two bytes, the header `{"camera", "channel", "width", "height"}`, and a byte a pixel. A message from
@@ -85,7 +85,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """What to open in a browser; whoever knows it may look."""
+        """The address to open in a browser; knowing it is all that is needed to look."""
         return f"http://127.0.0.1:{self.port}/?token={self._token}"
 
     def picture(self, prefix: str, name: str, t_us: int, picture: NDArray[np.uint8]) -> None:
@@ -109,7 +109,7 @@ class PageServer:
         try:
             self._loop.call_soon_threadsafe(self._show, key, message)
         except RuntimeError:
-            return  # the loop has ended: nobody looks any more
+            return  # the loop has ended, and with it every viewer
 
     def _show(self, key: tuple[str, str], message: str | bytes) -> None:
         if key not in self._latest:

@@ -32,17 +32,17 @@ class Shows(Protocol):
 
 
 class ViewSink:
-    """Shows the events that pass, what engines see of them, and what is read from those.
+    """Shows the events that pass, the state of engines, and emissions.
 
-    Events are drawn in the thread that they pass in, as often as `rate` says. Where somebody looks on, sights
-    of engines wait in a slot for the thread that writes, and are drawn there: engines do not wait. Where only
-    a file is written, they are drawn as they come, so that none is missing.
+    Events are drawn in the thread that they pass in, as often as `rate` says. Where there may be viewers,
+    sights of engines wait in a slot for the thread that writes, and are drawn there: engines do not wait.
+    Where only a file is written, they are drawn as they come, so that none is missing.
 
     Args:
         boards: where everything is shown; may be filled later.
         encoder: of the engines; None where there is none, and events are all that is shown.
         rate: pictures a second and camera.
-        live: of the clock, and for somebody who looks on; else of the stream.
+        live: by the clock, for viewers; else by stream time.
         prefix: of the channels, given the topic of the camera.
         drops: what was dropped so far, by reason.
     """
@@ -88,7 +88,7 @@ class ViewSink:
         return Pace(self._rate) if self._live else Pace(self._rate, clock=None)
 
     def write(self, emissions: Sequence[Emission]) -> None:
-        """Show what is due, and the reading at the end of each sample, which is the one that counts."""
+        """Show what is due, and the emission at the end of each sample, which is the one that is scored."""
         latest: dict[str, Emission] = {}
         for e in emissions:
             latest[e.topic] = e
@@ -106,7 +106,7 @@ class ViewSink:
                 self._tell(latest[topic])
 
     def close(self, *, failed: bool) -> None:
-        """Nothing is held open; boards belong to whoever opened them."""
+        """Do nothing; boards are closed where they were opened."""
 
     def _is_due(self, e: Emission) -> bool:
         return self._paces.setdefault(e.topic, Pace(self._rate, clock=None)).is_due(e.t_us)

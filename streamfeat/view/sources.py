@@ -1,4 +1,4 @@
-"""What a view looks at: a recording that somebody plays, or live topics; with features or without.
+"""Sources of a view: a recording that is played, or live topics; with features or without.
 
 Lives here: `PlayJob` and `WatchJob`, which bring items through a tap to sessions, if there are any.
 Not here: pictures and boards (`sink`), the player itself (`player`), listening with features (`live.listen`).
@@ -7,7 +7,6 @@ Not here: pictures and boards (`sink`), the player itself (`player`), listening 
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -21,14 +20,16 @@ from streamfeat.files.locations import Location
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake, Warnings
 from streamfeat.live.names import Names
-from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
+from streamfeat.live.subscription import Subscription
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Recording, open_recording
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline, Processor
 from streamfeat.stream.replay import items_of_split
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import Sink
 from streamfeat.view.player import Player, Timeline
 from streamfeat.view.tap import EventTap
@@ -54,7 +55,7 @@ class NoFeatures:
 
 
 class PlayJob:
-    """A recording that is played, for somebody who looks on or for a file.
+    """A recording that is played, for viewers or into a file.
 
     Args:
         source: the recording.
@@ -63,7 +64,7 @@ class PlayJob:
         emit: when to read.
         speed: played seconds for each of the clock; None for as fast as possible.
         loop: start again at the end.
-        stays: stay at the end, for somebody may seek.
+        stays: stay at the end, because a viewer may seek.
         split: play samples of this split only.
         topic: event topic, where there are several.
         reading: how to read what is no MCAP, and what to take out.
@@ -138,7 +139,7 @@ class PlayJob:
         self.player.stop()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         lost = sum(list(self.player.losses.counts.values()))
         if self._session is None:
             return {"lost": lost}
@@ -161,9 +162,7 @@ class WatchJob:
 
     Args:
         names: of the topics.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
-        reliable: recover missed packets, from publishers that do the same.
+        network: where to listen; `reliable` recovers missed packets, from publishers that do the same.
         console: for warnings.
     """
 
@@ -171,13 +170,11 @@ class WatchJob:
         self,
         names: Names,
         *,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
-        reliable: bool = False,
+        network: Network = THIS_MACHINE,
         console: Console | None = None,
     ) -> None:
         """Nothing is subscribed to before `run`."""
-        self._names, self._zenoh_config, self._port, self._reliable = names, zenoh_config, port, reliable
+        self._names, self._network = names, network
         self._inbox = Inbox()
         self._intake = Intake(self._inbox, _WINDOW_US, Warnings.on(console))
         self.interrupted = False
@@ -188,9 +185,9 @@ class WatchJob:
         Raises:
             InputError: the network cannot be used.
         """
-        with open_session(self._zenoh_config, port=self._port) as session, signals_wait():
+        with self._network.open() as session, signals_wait():
             pipeline: Pipeline[Any, Emission] = Pipeline(tap.items(self._intake), NoFeatures(), [sink])
-            with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+            with Subscription(session, self._names, self._inbox, reliable=self._network.reliable):
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
 
     def stop(self) -> None:
@@ -198,7 +195,7 @@ class WatchJob:
         self._inbox.close()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         delivery = self._intake.delivery()
         return {"lost": delivery.lost, "dropped": self._inbox.dropped, "duplicates": delivery.duplicates}
 

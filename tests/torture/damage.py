@@ -32,6 +32,7 @@ from streamfeat.errors import InputError
 from streamfeat.recordings.reader import Label, Losses, Packet, open_recording
 from streamfeat.recordings.writer import RecordingWriter, recover
 from streamfeat.stream.emission import Emission
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.replay import ReplayJob
 from torture.table import Row, Trials
 
@@ -346,7 +347,7 @@ def _check_features(specimen: Specimen, path: Path, whole: Sequence[int], losses
 
 def _replay(path: Path, played: _Played) -> Losses:
     job = ReplayJob(path, MODEL, emit=_EMIT)
-    job.run(more=played)
+    job.run(Outputs(more=played))
     return job.losses
 
 

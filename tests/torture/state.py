@@ -17,12 +17,13 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.events import Events, make_events
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.live.network import open_session
+from streamfeat.live.network import Network, open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
 from streamfeat.messages.packets import Packet
 from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.session import Session
 from torture.nursery import Nursery, free_port
 from torture.table import Row, Trials
@@ -46,15 +47,15 @@ def listener(words: list[str]) -> None:
         PlainNames(KEY),
         Path(model),
         emit="10ms",
-        reliable=True,
-        port=int(port),
+        network=Network(None, int(port), reliable=True),
+        publish=False,
         state=Path(kept),
         state_every_s=0.05,
         silence_s=1e9,
         patience_s=1e9,
         max_delay_s=1e9,
     )
-    job.run(json_lines=sys.stdout, with_features=True, publish=False)
+    job.run(Outputs(json_lines=sys.stdout, with_features=True))
 
 
 def state(trials: Trials) -> list[Row]:
