@@ -441,6 +441,18 @@ def make_libcaer_cmp(rng):
     return words, int(rng.integers(0, 2**50)), np.zeros(3, np.int64), np.zeros(8 * len(words), EVENT_DTYPE)
 
 
+def make_mono(rng):
+    words = rng.integers(0, 2**64, int(rng.integers(0, 80)), np.uint64)
+    return words, int(rng.integers(0, 2**54)), int(rng.integers(0, 1000)), np.zeros(len(words), EVENT_DTYPE)
+
+
+def make_time_span(rng):
+    events = np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
+    events["x"], events["y"] = rng.integers(0, 12, len(events)), rng.integers(0, 12, len(events))
+    events["t"] = rng.integers(-(2**62), 2**62, len(events))
+    return events, int(rng.integers(1, 12)), int(rng.integers(1, 12)), np.array([7, 7])
+
+
 def random_words(rng, kinds):
     n = int(rng.integers(0, 80))
     return (rng.choice(kinds, n) << 12 | rng.integers(0, 4096, n)).astype(np.uint16)
@@ -917,6 +929,8 @@ KERNELS = [
     Row(code.gain, make_gain),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
+    Row(decode.decode_mono, make_mono),
+    Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),

@@ -89,6 +89,19 @@ def decode_libcaer_cmp(words, base_us, state, out):
     return _write(events, out)
 
 
+def decode_mono(words, base_us, rest_ns, out):
+    for i, word in enumerate(words.tolist()):
+        ns = rest_ns + word % 2**32
+        out[i] = word // 2**32 % 2**16, word // 2**48 % 2**15, word // 2**63, base_us + ns // 1000
+
+
+def time_span(events, height, width, span):
+    t = events["t"][(events["x"] < width) & (events["y"] < height)]
+    if len(t):
+        span[:] = t.min(), t.max()
+    return len(t)
+
+
 def _write(events, out):
     for i, event in enumerate(events):
         out[i] = event

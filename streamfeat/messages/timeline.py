@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
+from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.clock import CameraClock
 from streamfeat.messages.delivery import Delivery, fingerprint_of
@@ -84,6 +85,7 @@ class Timeline:
         self._last_us: int | None = None
         self._log_time_ns = 0
         self._heard_ns = 0
+        self._span = np.zeros(2, np.int64)
         self._lost = 0
         self._counts_anew = False
         self._held: _Held | None = None
@@ -147,15 +149,13 @@ class Timeline:
             yield replace(packet, lost=self._taken_lost(), epoch=self._clock.epoch)
             return
         t = events["t"]
-        first, last = int(t.min()), int(t.max())
-        if int(events["x"].max()) >= width or int(events["y"].max()) >= height:
-            # Events outside the sensor are rejected later; their times have no say.
-            inside = t[(events["x"] < width) & (events["y"] < height)]
-            if len(inside) == 0:
-                yield from self._settled(first)
-                yield replace(packet, lost=self._taken_lost(), epoch=self._clock.epoch)
-                return
-            first, last = int(inside.min()), int(inside.max())
+        # Events outside the sensor are rejected later; their times have no say.
+        n_inside = time_span(np.require(events, requirements=["C", "A", "W"]), height, width, self._span)
+        first, last = self._span.tolist()
+        if n_inside == 0:
+            yield from self._settled(int(t.min()))
+            yield replace(packet, lost=self._taken_lost(), epoch=self._clock.epoch)
+            return
         tail = 0
         before_us = self._place_before(first)
         if last - first > _STEP_US or (before_us is not None and first < before_us - _BACK_US <= last):
@@ -228,10 +228,10 @@ class Timeline:
         self._counts_anew = False
         if place.event:
             self._events[{"wrapped": "wraps", "restarted": "restarts", "jumped": "jumps"}[place.event]] += 1
-        events = packet.events
         if place.offset_us:
-            events = events.copy()
+            events = packet.events.copy()
             events["t"] += np.int64(place.offset_us)
+            packet = replace(packet, events=events)
         first, last = held.first_us + place.offset_us, held.last_us + place.offset_us
         if self._last_us is None or place.event in ("restarted", "jumped"):
             self._last_us = last
@@ -239,7 +239,9 @@ class Timeline:
             self._events["steps back"] += first < self._last_us
             self._last_us = max(self._last_us, last)
         self._log_time_ns = packet.log_time_ns
-        return replace(packet, events=events, lost=self._taken_lost(), epoch=place.epoch)
+        if self._lost == 0 and place.epoch == 0:
+            return packet
+        return replace(packet, lost=self._taken_lost(), epoch=place.epoch)
 
 
 def stray_events(t: NDArray[np.int64], before_us: int | None) -> NDArray[np.bool_]:

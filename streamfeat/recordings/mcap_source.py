@@ -7,10 +7,8 @@ Not here: the file format and its damage (`records`), what messages mean (`strea
 import math
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import BinaryIO
 
-import zstandard
 from mcap.records import Channel, Schema
 
 from streamfeat.files.locations import Location
@@ -18,7 +16,6 @@ from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.event_messages import EVENT_SCHEMAS, ros2_name
 from streamfeat.recordings.order import are_in_order, clean_cuts, in_log_order
 from streamfeat.recordings.records import (
-    MAX_RECORD_BYTES,
     Block,
     Losses,
     Summary,
@@ -93,7 +90,7 @@ class McapSource:
                     seen[channel.id] += 1
                     layout = "ros1" if channel.message_encoding == "ros1" else "cdr"
                     stored = message.log_time, message.sequence, seen[channel.id]
-                    item = StoredMessage(channel.topic, kind, layout, _whole(message.data), *stored)
+                    item = StoredMessage(channel.topic, kind, layout, message.data, *stored)
                     if kind == LabelMessage.SCHEMA_NAME:
                         labels.append((at, item))
                         continue
@@ -123,17 +120,6 @@ class McapSource:
     def close(self) -> None:
         """See `Source`."""
         self._file.close()
-
-
-def _whole(data: bytes) -> bytes:
-    """A message without the compression that rosbag2 gives each; as it is where that is damaged."""
-    if not data.startswith(zstandard.FRAME_HEADER):
-        return data
-    with suppress(zstandard.ZstdError):
-        whole = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES + 1)
-        if len(whole) <= MAX_RECORD_BYTES:
-            return whole
-    return data
 
 
 def _scan(file: BinaryIO) -> Summary:

@@ -23,6 +23,9 @@ BUFFER_BYTES = 64 << 20
 _OVERHEAD = 512
 """What a message costs besides its data."""
 
+_Waiting = tuple[int, int, int, StoredMessage]
+"""Log time, number of arrival, byte, message: sorts by the first two."""
+
 
 def clean_cuts(blocks: Sequence[Block]) -> list[int]:
     """Bytes of the blocks before which everything is earlier than all that follows.
@@ -59,60 +62,44 @@ def in_log_order(
         byte and message; one that came too late for its place is given at once.
     """
     ranks = {block.at: rank for rank, block in enumerate(blocks)}
-    starts = sorted(ranks)
-    earliest = [*_earliest_from(blocks), None]
-    waiting: list[tuple[int, int, int, StoredMessage]] = []
-    held, count, given_ns, present = 0, 0, -1, -1
-    block_at, safe_ns = -1, -1
-    is_sorted = True
+    starts, earliest = sorted(ranks), _earliest_from(blocks)
+    waiting: list[_Waiting] = []
+    is_heap = False
+    held, count, given_ns = 0, 0, -1
+    block_at = rank = -1
     for at, message in messages:
-        if at != block_at and starts:
-            block_at = at
+        if starts and at != block_at:
+            block_at, before = at, rank
             known = bisect_right(starts, at) - 1
             rank = ranks[starts[known]] if known >= 0 else -1
-            if rank != present:
+            if rank != before:
                 # Nothing of this block or of those behind it is earlier than this.
-                present, safe = rank, earliest[max(rank, 0)]
-                safe_ns = -1 if safe is None else safe
-                if is_sorted and waiting and waiting[-1][0] <= safe_ns:
-                    ready, waiting = waiting, []
-                    held = 0
-                    for _, _, place, item in ready:
-                        yield place, item
-                    given_ns = max(given_ns, ready[-1][0])
-                else:
-                    if not is_sorted:
-                        waiting.sort(key=lambda entry: entry[:2])
-                        is_sorted = True
-                    ready, waiting = _split(waiting, safe_ns)
-                    for _, _, place, item in ready:
-                        held -= len(item.data) + _OVERHEAD
-                        given_ns = max(given_ns, item.log_time_ns)
-                        yield place, item
-        time_ns = message.log_time_ns
-        if time_ns < given_ns:
+                waiting.sort()
+                is_heap = False
+                ready, waiting = _split(waiting, earliest[rank])
+                for time_ns, _, place, item in ready:
+                    given_ns = time_ns
+                    yield place, item
+                waiting = [_on_its_own(entry) for entry in waiting]
+                held = sum(len(item.data) + _OVERHEAD for *_, item in waiting)
+        if message.log_time_ns < given_ns:
             yield at, message
             continue
         count += 1
-        if is_sorted and waiting and time_ns < waiting[-1][0]:
-            is_sorted = False
-            heapq.heapify(waiting)
-        if is_sorted:
-            waiting.append((time_ns, count, at, message))
+        if is_heap:
+            heapq.heappush(waiting, (message.log_time_ns, count, at, message))
         else:
-            heapq.heappush(waiting, (time_ns, count, at, message))
+            waiting.append((message.log_time_ns, count, at, message))
         held += len(message.data) + _OVERHEAD
-        if held > limit_bytes:
-            # A sorted list is a heap.
-            if is_sorted:
-                heapq.heapify(waiting)
-                is_sorted = False
-            while held > limit_bytes:
-                _, _, place, item = heapq.heappop(waiting)
-                held -= len(item.data) + _OVERHEAD
-                given_ns = item.log_time_ns
-                yield place, item
-    for _, _, place, item in sorted(waiting, key=lambda entry: entry[:2]):
+        if held > limit_bytes and not is_heap:
+            heapq.heapify(waiting)
+            is_heap = True
+        while held > limit_bytes:
+            given_ns, _, place, item = heapq.heappop(waiting)
+            held -= len(item.data) + _OVERHEAD
+            yield place, item
+    waiting.sort()
+    for *_, place, item in waiting:
         yield place, item
 
 
@@ -121,9 +108,15 @@ def _earliest_from(blocks: Sequence[Block]) -> list[int]:
     return list(accumulate((block.first_ns for block in reversed(blocks)), min))[::-1]
 
 
-def _split(
-    waiting: list[tuple[int, int, int, StoredMessage]], safe_ns: int
-) -> tuple[list[tuple[int, int, int, StoredMessage]], list[tuple[int, int, int, StoredMessage]]]:
+def _split(waiting: list[_Waiting], safe_ns: int) -> tuple[list[_Waiting], list[_Waiting]]:
     """A sorted list before and after a time; what is of that time comes before."""
     place = bisect_right(waiting, safe_ns, key=lambda entry: entry[0])
     return waiting[:place], waiting[place:]
+
+
+def _on_its_own(entry: _Waiting) -> _Waiting:
+    """The same with bytes of its own: a view would keep all of its chunk in memory."""
+    time_ns, count, at, message = entry
+    if isinstance(message.data, memoryview):
+        message = message._replace(data=bytes(message.data))
+    return time_ns, count, at, message

@@ -24,7 +24,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Header, Message, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Header, Message, Schema, Statistics
 
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, open_binary
@@ -57,6 +57,7 @@ _CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
 
+_CHUNK = struct.Struct("<QQQII")  # times, size and CRC of its records, length of the compression's name
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 
 _NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
@@ -145,9 +146,9 @@ def iter_records(
 ) -> Iterator[tuple[int, Record]]:
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
-    Messages of a chunk carry the byte of the chunk. Damage is skipped up to the next readable record or
-    chunk and counted in `losses`, which is changed. Nothing is raised but errors of reading: `OSError`, or
-    `InputError` where the file is in a store.
+    Messages of a chunk carry the byte of the chunk, and their data is a view of it. Damage is skipped up to
+    the next readable record or chunk and counted in `losses`, which is changed. Nothing is raised but errors
+    of reading: `OSError`, or `InputError` where the file is in a store.
 
     Args:
         file: opened by `open_mcap`.
@@ -262,7 +263,8 @@ def _one_record(
     try:
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
-            record = Message(channel, log_time, bytes(body[_MESSAGE_HEAD.size :]), publish_time, sequence)
+            data = memoryview(body)[_MESSAGE_HEAD.size :]
+            record = Message(channel, log_time, data, publish_time, sequence)  # type: ignore[arg-type]
         elif opcode == Opcode.CHANNEL:
             record = Channel.read(ReadDataStream(BytesIO(body)))
         else:
@@ -275,7 +277,7 @@ def _one_record(
 
 def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
     try:
-        data = _decompress(Chunk.read(ReadDataStream(BytesIO(body))))
+        data = _records_of_chunk(memoryview(body))
     except _DAMAGE as error:
         losses.add("damaged chunk", len(body), f"byte {at}: {error or type(error).__name__}")
         return
@@ -302,28 +304,32 @@ def _cut_chunk(body: bytes, at: int) -> Iterator[tuple[int, Record]]:
                 yield from _one_record(opcode, view[start:inner], at, Losses())
 
 
-def _decompress(chunk: Chunk) -> bytes:
+def _records_of_chunk(body: memoryview) -> bytes | memoryview:
     """Uncompress a chunk, never to more than it claims, and check its CRC."""
-    claimed = chunk.uncompressed_size
+    _, _, claimed, crc, name_length = _CHUNK.unpack_from(body)
+    start = _CHUNK.size + name_length + 8
+    (length,) = struct.unpack_from("<Q", body, start - 8)
+    compression, stored = bytes(body[_CHUNK.size : start - 8]), body[start : start + length]
+    if len(stored) < length:
+        raise ValueError(f"the chunk claims {length} stored bytes and holds {len(stored)}")
     if claimed > MAX_RECORD_BYTES:
         raise ValueError(f"the chunk claims {claimed} bytes, the limit is {MAX_RECORD_BYTES}")
-    if chunk.compression == "zstd":
+    data: bytes | memoryview = stored
+    if compression == b"zstd":
         # `zstandard.decompress` believes the size in the frame; the stream reader takes ours.
         try:
-            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(claimed + 1)
+            data = zstandard.ZstdDecompressor().stream_reader(stored).read(claimed + 1)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from None
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=claimed + 1)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"unknown compression {chunk.compression!r}")
+    elif compression == b"lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=claimed + 1)
+    elif compression:
+        raise ValueError(f"unknown compression {compression.decode()!r}")
     if len(data) != claimed:
         raise ValueError(f"the chunk claims {claimed} bytes and holds {len(data)}")
-    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+    if crc not in (0, zlib.crc32(data)):
         raise ValueError("the CRC of the chunk does not match")
-    return bytes(data)
+    return data
 
 
 def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:

@@ -290,7 +290,7 @@ class RecordingWriter:
                 self._schemas.get(channel.schema_id, 0),
                 channel.metadata,
             )
-        times = message.log_time, message.data, message.publish_time
+        times = message.log_time, bytes(message.data), message.publish_time
         self._add(self._channels[channel.id], *times, message.sequence)
 
     def _add(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
