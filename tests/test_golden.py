@@ -1,4 +1,4 @@
-"""Files of commit 48b5f29 still give the bits that they gave there: models, recordings, a classifier, a state.
+"""Models, recordings, a classifier and a state of commit 48b5f29 still give the bits that they gave there.
 
 `tests/make_golden.py` made them, and says how. Times and features are compared whole, by their digests.
 """

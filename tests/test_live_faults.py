@@ -26,6 +26,8 @@ from streamfeat.live.network import open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
 
+pytestmark = pytest.mark.real_time
+
 KEY = "cam/a/events"
 
 PUBLISHER = """

@@ -15,6 +15,8 @@ from streamfeat.live.names import PlainNames, RosNames
 from streamfeat.live.network import FoundTopic, find_topics
 from streamfeat.live.publish import PublishJob
 
+pytestmark = pytest.mark.real_time
+
 MODEL = tiny.encoder(k=3)
 HASH = "RIHS01_d6fa176260b1f37e5a40845305315e150a0f18191241eb64f407442aa29844aa"
 TYPE = "event_camera_msgs::msg::dds_::EventPacket_"
