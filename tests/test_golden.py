@@ -106,3 +106,13 @@ def test_a_file_of_another_format_version_is_refused_in_one_line(name, kind, loa
         load(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "load"),
+    [("classifier", sf.Encoder.load), ("direct-split", sf.Classifier.load), ("direct-split", resumed)],
+)
+def test_a_file_of_another_kind_is_refused_in_one_line(name, load):
+    with pytest.raises(InputError, match="but not a .* file") as error:
+        load(of_model(name))
+    assert "\n" not in str(error.value)
