@@ -113,6 +113,6 @@ def test_a_file_of_another_format_version_is_refused_in_one_line(name, kind, loa
     [("classifier", sf.Encoder.load), ("direct-split", sf.Classifier.load), ("direct-split", resumed)],
 )
 def test_a_file_of_another_kind_is_refused_in_one_line(name, load):
-    with pytest.raises(InputError, match="but not a .* file") as error:
+    with pytest.raises(InputError, match=r"but not a .* file") as error:
         load(of_model(name))
     assert "\n" not in str(error.value)

@@ -23,7 +23,7 @@ from streamfeat.files.json_fields import Fields
     ],
 )
 def test_what_is_not_of_its_type_or_bounds_is_one_line(values, take):
-    with pytest.raises(InputError, match="^file") as error:
+    with pytest.raises(InputError, match=r"^file") as error:
         take(Fields(values, "file"))
     assert "\n" not in str(error.value)
 

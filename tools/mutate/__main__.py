@@ -1,9 +1,12 @@
 """Try mutants: `python -m tools.mutate [--only TEXT ...] [--list]`.
 
 Lives here: a copy of the tree, one fault in it, and the tests that must notice; a table of what they did.
-Not here: the faults (`mutants`). Neither mutmut nor cosmic-ray: they make thousands of mutants, and numba keeps
-machine code beside a kernel's source, so that one of a callee would be tried with yesterday's caller. Here each
-mutant of a kernel starts with an empty cache of its own.
+Not here: the faults (`mutants`).
+
+Why neither mutmut nor cosmic-ray: they make thousands of mutants, each with a minute of compiling here, and
+numba keeps the machine code of a caller whose callee was changed, so that a mutant would be tried with the
+code of before. Here each mutant of a kernel starts with an empty cache of its own. That the tests pass without
+a mutant is for the suite to say; a test that fails anyway would count as one that noticed.
 """
 
 import argparse
@@ -83,10 +86,8 @@ def main() -> None:
             started = time.monotonic()
             verdict, said = try_mutant(mutant, tree, caches)
             tally[verdict] += 1
-            print(
-                f"{verdict:9}{time.monotonic() - started:5.0f} s  {mutant.file}: {mutant.name}  [{said}]",
-                flush=True,
-            )
+            took = f"{time.monotonic() - started:5.0f} s"
+            print(f"{verdict:9}{took}  {mutant.file}: {mutant.name}  [{said}]", flush=True)
     print(f"{len(chosen)} tried, " + ", ".join(f"{n} {verdict}" for verdict, n in sorted(tally.items())))
     sys.exit(int(tally["killed"] < len(chosen)))
 

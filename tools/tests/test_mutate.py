@@ -1,4 +1,4 @@
-"""The list of mutants is true: each text stands once, names are unique, and tests that must notice are there."""
+"""The list of mutants is true: each text stands once, names are unique, and its tests are there."""
 
 import shlex
 from pathlib import Path
