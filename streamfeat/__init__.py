@@ -18,39 +18,53 @@ if TYPE_CHECKING:
     from streamfeat.learn.transform import TransformLearner
     from streamfeat.recordings.reader import open_recording
     from streamfeat.recordings.writer import RecordingWriter
+    from streamfeat.stream.emission import Emission, EmitPolicy
+    from streamfeat.stream.emissions import replay
+    from streamfeat.stream.pipeline import Pipeline
+    from streamfeat.stream.session import Session
 
 __all__ = [
     "EVENT_DTYPE",
     "Classifier",
     "DictionaryLearner",
+    "Emission",
+    "EmitPolicy",
     "Encoder",
     "Engine",
     "EventFeatures",
     "Geometry",
     "InputError",
     "OnlineClassifier",
+    "Pipeline",
     "RecordingWriter",
+    "Session",
     "TransformLearner",
     "as_events",
     "make_events",
     "open_recording",
+    "replay",
 ]
 
 _HOMES = {
     "EVENT_DTYPE": "events",
     "Classifier": "classify.classifier",
     "DictionaryLearner": "learn.dictionary",
+    "Emission": "stream.emission",
+    "EmitPolicy": "stream.emission",
     "Encoder": "engine.encoder",
     "Engine": "engine.engine",
     "EventFeatures": "classify.features",
     "Geometry": "engine.geometry",
     "InputError": "errors",
     "OnlineClassifier": "classify.classifier",
+    "Pipeline": "stream.pipeline",
     "RecordingWriter": "recordings.writer",
+    "Session": "stream.session",
     "TransformLearner": "learn.transform",
     "as_events": "events",
     "make_events": "events",
     "open_recording": "recordings.reader",
+    "replay": "stream.emissions",
 }
 
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from streamfeat.live.inbox import Inbox, RawMessage
+from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.stream.cameras import CameraLeft
 
 SECOND = 1_000_000_000
@@ -82,3 +82,24 @@ def test_closing_wakes_who_waits_and_keeps_what_is_there():
     inbox.put(raw())
     assert len(inbox.take(0)) == 1
     assert inbox.take(0) is None
+
+
+def test_announcements_without_end_are_refused_and_counted():
+    inbox = Inbox()
+    for i in range(300_000):
+        inbox.put(Announcement(f"made-up/{i}", here=True))
+    inbox.put(raw(number=7))
+    assert inbox.depth == 4097
+    assert inbox.refused == 300_000 - 4096
+    taken = [item for _ in range(65) for item in inbox.take(0)]
+    assert numbers(taken) == [7]
+    inbox.put(Announcement("made-up/last", here=True))
+    assert inbox.take(0) == [Announcement("made-up/last", here=True)]
+
+
+def test_topics_without_end_cost_no_memory_when_their_messages_are_dropped():
+    inbox = Inbox(max_bytes=1512)
+    for i in range(20_000):
+        inbox.put(raw(f"made-up/{i}"))
+    assert inbox.dropped == 19_999
+    assert len(inbox._dropped) == 4096

@@ -1,5 +1,6 @@
 """Recordings as cameras and hosts leave them: restarts, strays, gaps, copies, disorder, other types."""
 
+import hashlib
 import struct
 from dataclasses import dataclass, replace
 
@@ -13,15 +14,18 @@ from streams import random_encoder
 
 from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
+from streamfeat.learn.volumes import windows_of
 from streamfeat.messages.cdr import EventArray, EventPacket
 from streamfeat.messages.codecs import encode
-from streamfeat.messages.packets import Packet
+from streamfeat.messages.packets import Label, Packet
 from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.order import BUFFER_BYTES, in_log_order
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.records import Block
 from streamfeat.recordings.sources import StoredMessage
+from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.pipeline import _Pace
 from streamfeat.stream.session import Session
 
 HEIGHT, WIDTH = 48, 64
@@ -320,3 +324,106 @@ def test_messages_compressed_one_by_one(tmp_path):
     events = moving_dot(4000, 5_000_000)
     made = [replace(m, data=zstandard.compress(m.data)) for m in messages(events)]
     np.testing.assert_array_equal(read(store(tmp_path / "a.mcap", made))[1], events)
+
+
+# --- files cut short
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.6, 0.9])
+def test_whole_messages_of_a_cut_chunk_are_recovered(run, tmp_path, keep):
+    events = moving_dot(4000, 5_000_000)
+    whole = store(
+        tmp_path / "a.mcap", messages(events), chunk_size=1 << 20, compression=CompressionType.NONE
+    ).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    payloads = [whole.find(message.data) + len(message.data) for message in messages(events)]
+    cut.write_bytes(whole[: int(payloads[-1] * keep)])
+    n = 200 * sum(end <= cut.stat().st_size for end in payloads)
+    assert 0 < n < 4000
+    said = run("recover", cut, tmp_path / "b.mcap", "--json")
+    assert said.status == 0
+    np.testing.assert_array_equal(read(tmp_path / "b.mcap")[1], events[:n])
+    assert f"the file ends at byte {cut.stat().st_size}" in run("info", cut).err
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_where_nothing_can_be_recovered_the_command_fails(run, tmp_path, compression):
+    whole = store(
+        tmp_path / "a.mcap", messages(moving_dot(4000, 0)), chunk_size=1 << 20, compression=compression
+    )
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:5000])
+    said = run("recover", cut, tmp_path / "b.mcap")
+    assert said.status == 2
+    assert "no whole message could be recovered" in said.err
+    assert not (tmp_path / "b.mcap").exists()
+
+
+# --- what is shown, and what goes on
+
+
+def test_the_digest_is_of_the_events_alone(run, tmp_path):
+    events = moving_dot(4000, 5_000_000)
+    wanted = hashlib.sha256(
+        b"".join(struct.pack("<HHBq", e["x"], e["y"], e["p"], e["t"]) for e in events)
+    ).hexdigest()
+    for name, made in {
+        "plain": messages(events),
+        "other packets": messages(events, "evt3", n=33),
+        "copies backwards": messages(events, "libcaer")[::-1] * 2,
+    }.items():
+        assert run("info", store(tmp_path / f"{name}.mcap", made), "--json").json["digest"] == wanted
+
+
+def test_info_tells_what_happened(run, tmp_path):
+    made = messages(moving_dot(4000, 5_000_000)) + messages(moving_dot(4000, 0), host_us=3_000_000)
+    said = run("info", store(tmp_path / "a.mcap", made[:4] + made[5:] + made[30:31]), "--json").json
+    assert (said["restarts"], said["lost"], said["duplicates"], said["stray_packets"]) == (1, 1, 1, 0)
+
+
+def test_a_looped_recording_goes_on_with_its_labels_and_epochs(tmp_path):
+    made = messages(moving_dot(400, 5_000_000)) + messages(moving_dot(400, 0), host_us=3_000_000)
+    with open_recording(store(tmp_path / "a.mcap", made)) as recording:
+        played = [item for item, _ in zip(recording.played(loop=True), range(12), strict=False)]
+    assert [packet.epoch for packet in played] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    # one round spans 5.0998 s, and a second of silence follows
+    step_us = 5_099_750 + 1_000_000
+    starts = [int(packet.events["t"][0]) for packet in played]
+    assert starts[4:8] == [start + step_us for start in starts[:4]]
+
+
+def test_labels_of_a_looped_recording_are_shifted(tmp_path):
+    label = Label(5_010_000, 20_000, "car")
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        writer.write_label(label)
+        writer.write_events(moving_dot(400, 5_000_000), (HEIGHT, WIDTH))
+    with open_recording(tmp_path / "a.mcap") as recording:
+        played = [item for item, _ in zip(recording.played(loop=True), range(6), strict=False)]
+    shift_us = 99_750 + 1_000_000
+    assert [item.start_us for item in played if isinstance(item, Label)] == [
+        label.start_us + i * shift_us for i in range(3)
+    ]
+
+
+@pytest.mark.parametrize("again_us", [0, 1 << 50])
+def test_a_jump_of_the_clock_neither_waits_nor_bursts(again_us):
+    pace, now_s, dues = _Pace(2.0), 100.0, []
+    for epoch, start_us in enumerate([5_000_000, again_us]):
+        for i in range(5):
+            t_us = start_us + 100_000 * i
+            packet = Packet("", make_events([0], [0], [1], [t_us]), (HEIGHT, WIDTH), 0, 0, epoch=epoch)
+            dues.append(pace.due(packet, t_us, now_s))
+    assert dues == pytest.approx([100 + i / 20 for i in (0, 1, 2, 3, 4, 4, 5, 6, 7, 8)])
+
+
+def test_windows_of_learning_begin_anew_with_the_clock(tmp_path):
+    geometry = Geometry(patch=4, stride=4, n_bins=2, bin_us=1_000_000)
+    made = messages(moving_dot(400, 5_000_000)) + messages(
+        moving_dot(400, 5_000_000 - 600_000), host_us=1_000_000
+    )
+    with open_recording(store(tmp_path / "a.mcap", made)) as recording:
+        windows = list(windows_of(recording.items(), geometry))
+    assert [(window.origin_us, len(window.events)) for window in windows] == [
+        (5_000_000, 400),
+        (4_400_000, 400),
+    ]

@@ -27,6 +27,7 @@ from streamfeat.simulate.saccades import CameraModel, digit_samples
 __all__ = ["EXTRAS", "examine"]
 
 EXTRAS = {
+    "bags": "bags of ROS 1 and 2 as recordings",
     "cluster": "work on other processes and machines",
     "convert": "Prophesee HDF5 files",
     "export": "Arrow, Parquet and pandas",

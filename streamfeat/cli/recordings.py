@@ -46,6 +46,7 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording."""
+    from streamfeat.messages.timeline import TIMELINE_COUNTS
     from streamfeat.recordings.reader import open_recording
 
     with open_recording(recording, topic, reading) as rec:
@@ -73,6 +74,8 @@ def info(
             "samples": len(rec.labels),
             "labels": ", ".join(labels),
             "splits": ", ".join(splits),
+            "digest": rec.digest,
+            **{name.replace(" ", "_"): rec.counts[name] for name in TIMELINE_COUNTS},
             "integrity": "damaged" if rec.losses else "intact",
         } | rec.removed
         print_result(result, str(recording), as_json=as_json)

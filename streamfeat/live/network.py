@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Full, Queue
 from types import TracebackType
 from typing import Any, Self
 
@@ -38,6 +38,10 @@ DEFAULT_PORT = 7447
 _MAX_MESSAGE_BYTES = 16 << 20
 """What zenoh puts together from fragments; a message of more never reaches us."""
 _QUEUED_BATCHES = 16
+_MAX_TOKENS = 1 << 14
+"""Publishers that are known at a time; announcements of further ones are refused and counted."""
+_MAX_COME = 1 << 10
+"""Announced topics that may wait for a subscription."""
 """Of 64 kB, the most that zenoh allows: a reader that hesitates costs a camera nothing yet."""
 _PATIENCE = {"drop": {"wait_before_drop": 50_000}, "block": {"wait_before_close": 60_000_000}}
 """Microseconds: how long a full queue may stay full before zenoh drops a message, or closes the link."""
@@ -146,9 +150,10 @@ class Subscription:
         self._shard = shard
         self._session, self._reliable = session, reliable
         # zenoh may not be asked for a subscription from within its own callbacks.
-        self._come: SimpleQueue[str | None] = SimpleQueue()
+        self._come: Queue[str | None] = Queue(_MAX_COME)
         self._follower = threading.Thread(target=self._follow, name="streamfeat follower", daemon=True)
         self._tokens: dict[str, set[str]] = {}
+        self._n_tokens = 0
         self._open: list[object] = []
         try:
             wanted = [] if announced else names.subscriptions
@@ -256,18 +261,32 @@ class Subscription:
         if not topic or (self._shard and not self._shard.has(topic)):
             return
         # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
-        tokens = self._tokens.setdefault(topic, set())
+        token, tokens = str(sample.key_expr), self._tokens.get(topic, set())
         if sample.kind == zenoh.SampleKind.PUT:
-            tokens.add(str(sample.key_expr))
+            if token in tokens:
+                return
+            if self._n_tokens >= _MAX_TOKENS:
+                self._inbox.refuse()
+                return
+            self._tokens.setdefault(topic, tokens).add(token)
+            self._n_tokens += 1
             if len(tokens) == 1:
                 self._inbox.put(Announcement(topic, here=True))
                 if self._follower.is_alive() and _is_of(self._wanted, topic):
-                    self._come.put(topic)
-            return
-        tokens.discard(str(sample.key_expr))
-        if not tokens:
-            del self._tokens[topic]
-            self._inbox.put(Announcement(topic, here=False))
+                    self._ask_for(topic)
+        elif token in tokens:
+            tokens.discard(token)
+            self._n_tokens -= 1
+            if not tokens:
+                del self._tokens[topic]
+                self._inbox.put(Announcement(topic, here=False))
+
+    def _ask_for(self, topic: str) -> None:
+        """Have the follower subscribe to a topic, unless too many wait for that already."""
+        try:
+            self._come.put_nowait(topic)
+        except Full:
+            self._inbox.refuse()
 
 
 class TopicWatch:

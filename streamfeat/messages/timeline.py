@@ -22,7 +22,21 @@ from streamfeat.messages.delivery import Delivery, fingerprint_of
 from streamfeat.messages.event_messages import parse_events
 from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
 
-__all__ = ["Timeline", "stray_events"]
+__all__ = ["TIMELINE_COUNTS", "Timeline", "stray_events"]
+
+TIMELINE_COUNTS = (
+    "restarts",
+    "jumps",
+    "wraps",
+    "steps back",
+    "lost",
+    "duplicates",
+    "reordered",
+    "stray packets",
+    "stray events",
+    "out of order",
+)
+"""What is counted, see `Timeline.counts`."""
 
 _BACK_US = 500_000
 """A fall of less than this is events out of order, of the same clock."""

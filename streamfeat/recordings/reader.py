@@ -10,13 +10,11 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
-
-import numpy as np
 
 from streamfeat.denoise.stage import Denoiser
 from streamfeat.errors import InputError
@@ -32,6 +30,7 @@ from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
 from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
+from streamfeat.recordings.totals import Totals
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -54,27 +53,6 @@ _MOST_PARTS = 1000
 
 HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
-
-
-@dataclass(slots=True)
-class _Totals:
-    """What only a full pass can tell."""
-
-    labels: list[Label] = field(default_factory=list)
-    n_on: int = 0
-    n_off: int = 0
-    first_us: int | None = None
-    last_us: int | None = None
-
-    def add(self, events: Events) -> None:
-        if len(events) == 0:
-            return
-        on = int(np.count_nonzero(events["p"]))
-        self.n_on += on
-        self.n_off += len(events) - on
-        first, last = int(events["t"].min()), int(events["t"].max())
-        self.first_us = first if self.first_us is None else min(first, self.first_us)
-        self.last_us = last if self.last_us is None else max(last, self.last_us)
 
 
 def open_recording(
@@ -310,8 +288,8 @@ class Recording:
         return complete_samples(self.placed_items(self._part), self._part.end, self.resolution)
 
     @cached_property
-    def _totals(self) -> _Totals:
-        totals = _Totals()
+    def _totals(self) -> Totals:
+        totals = Totals()
         for item in self.items():
             if isinstance(item, Label):
                 totals.labels.append(item)
@@ -338,6 +316,14 @@ class Recording:
     def n_events(self) -> int:
         """Number of events."""
         return self.n_on + self.n_off
+
+    @property
+    def digest(self) -> str:
+        """SHA-256, hexadecimal, of all events that are used, in their order: 13 bytes each, little-endian.
+
+        These are x and y (uint16), p (uint8) and t (int64, microseconds). Where packets end has no say.
+        """
+        return self._totals.hash.hexdigest()
 
     @property
     def first_us(self) -> int | None:

@@ -13,7 +13,6 @@ import os
 import re
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,8 +26,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Header, Message, Schema, Statistics
 
-from streamfeat.errors import InputError, printable
+from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, open_binary
+from streamfeat.recordings.losses import Losses
 
 __all__ = [
     "MAX_RECORD_BYTES",
@@ -62,33 +62,6 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 Record = Schema | Channel | Message
-
-
-@dataclass(slots=True)
-class Losses:
-    """What one pass over a recording could not read, by named reason."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    bytes: Counter[str] = field(default_factory=Counter)
-    first: dict[str, str] = field(default_factory=dict)
-    """For each reason, where it struck first and why."""
-    removed: Counter[str] = field(default_factory=Counter)  # as noise, on request: no losses
-
-    def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
-        """Count one loss."""
-        self.counts[reason] += count
-        self.bytes[reason] += n_bytes
-        if reason not in self.first:
-            self.first[reason] = printable(where)
-
-    def add_all(self, others: "Losses") -> None:
-        """Count the losses of another part of the same recording."""
-        self.counts, self.bytes = self.counts + others.counts, self.bytes + others.bytes
-        self.first, self.removed = others.first | self.first, self.removed + others.removed
-
-    def __bool__(self) -> bool:
-        """Whether anything was lost."""
-        return bool(self.counts)
 
 
 class Block(NamedTuple):
@@ -205,9 +178,13 @@ def iter_records(
             following = _find_chunk(file, trusted + 1, size)
             reason = "truncated" if following is None and after > size else "damaged record"
             where = f"byte {at}: record type {opcode} with {length} bytes cannot be here"
+            where += f"; the file ends at byte {size}" if after > size else ""
             start = at if following is None or following > at else trusted
             losses.add(reason, (following or size) - start, where)
             if following is None:
+                if reason == "truncated" and opcode == Opcode.CHUNK:
+                    file.seek(at + _FRAME.size)
+                    yield from _cut_chunk(file.read(MAX_RECORD_BYTES), at)
                 return
             at = trusted = following
             continue
@@ -312,6 +289,17 @@ def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, 
         inner = start + length
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             yield from _one_record(opcode, view[start:inner], at, losses)
+
+
+def _cut_chunk(body: bytes, at: int) -> Iterator[tuple[int, Record]]:
+    """The whole records of an uncompressed chunk that the end of the file cuts short."""
+    if body[28:32] == bytes(4):  # no compression
+        inner, view = 40, memoryview(body)
+        while inner + _FRAME.size <= len(body):
+            opcode, length = _FRAME.unpack_from(body, inner)
+            start, inner = inner + _FRAME.size, inner + _FRAME.size + length
+            if inner <= len(body) and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                yield from _one_record(opcode, view[start:inner], at, Losses())
 
 
 def _decompress(chunk: Chunk) -> bytes:

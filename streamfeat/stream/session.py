@@ -81,8 +81,7 @@ class Session:
             classifier = classifier.linear
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock = clock
-        self._topic = topic
+        self._clock, self._topic = clock, topic
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
@@ -91,8 +90,7 @@ class Session:
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
-        self._log_time_ns = 0
-        self._source_ns = 0
+        self._log_time_ns = self._source_ns = 0
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -398,7 +396,5 @@ def _sound(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:
     seen = engine.stats()
-    stats.events += seen.events
-    stats.late += seen.late
-    stats.rejected += seen.rejected
-    stats.saturated += seen.saturated
+    for name in ("events", "late", "rejected", "saturated"):
+        setattr(stats, name, getattr(stats, name) + getattr(seen, name))

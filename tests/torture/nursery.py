@@ -24,7 +24,7 @@ import numba, numpy, scipy.optimize, sklearn.linear_model, sklearn.model_selecti
 import streamfeat.cli, streamfeat.classify.classifier, streamfeat.classify.features
 import streamfeat.convert.datasets
 import streamfeat.evaluate.run, streamfeat.evaluate.tables, streamfeat.learn.fit, streamfeat.live.listen
-import streamfeat.live.record, tools.torture.state
+import streamfeat.live.record, torture.state
 
 for line in sys.stdin:
     task = json.loads(line)
@@ -39,7 +39,7 @@ for line in sys.stdin:
         status = 1
         try:
             if task["words"][0] == "@listener":
-                tools.torture.state.listener(task["words"][1:])
+                torture.state.listener(task["words"][1:])
             else:
                 streamfeat.cli.main()
             status = 0
@@ -64,12 +64,18 @@ class Nursery:
     def __init__(self, root: Path) -> None:
         self._pid = 0
         """Of the command that runs; its number stays its own until it is collected."""
+        path = os.pathsep.join((str(root), str(root / "tests")))
         self._mother = subprocess.Popen(
             [sys.executable, "-c", _MOTHER],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(root), "NO_COLOR": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env={
+                **os.environ,
+                "PYTHONPATH": path,
+                "NO_COLOR": "1",
+                "OPENBLAS_NUM_THREADS": "1",
+            },
         )
 
     def __enter__(self) -> Self:
