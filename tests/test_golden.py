@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """Models, recordings, a classifier and a state of commit 48b5f29 still give the bits that they gave there.
-=======
-"""Files of commit 48b5f29 give the bits that they gave there: models, recordings, a classifier, a state.
->>>>>>> main
 
 `tests/make_golden.py` made them, and says how. Times and features are compared whole, by their digests.
 """

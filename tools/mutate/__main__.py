@@ -5,7 +5,7 @@ Not here: the faults (`mutants`).
 
 Why neither mutmut nor cosmic-ray: they make thousands of mutants, each with a minute of compiling here, and
 numba keeps the machine code of a caller whose callee was changed, so that a mutant would be tried with the
-code of before. Here each mutant of a kernel starts with an empty cache of its own. That the tests pass without
+code of before. Here each mutant of a kernel starts with an empty cache of its own. That tests pass without
 a mutant is for the suite to say; a test that fails anyway would count as one that noticed.
 """
 
