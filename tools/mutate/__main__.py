@@ -58,10 +58,11 @@ def try_mutant(mutant: Mutant, tree: Path, caches: Path) -> tuple[str, str]:
         return "killed", f"no end after {LIMIT_S} s"
     finally:
         path.write_text(text)
-    said = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+    said = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
     # 1: tests failed; 2 and more: nothing was tried, which is no proof.
     verdict = {0: "survived", 1: "killed"}.get(done.returncode, "no test")
-    return verdict, (said or done.stdout.splitlines() or done.stderr.splitlines() or [""])[-1][:120]
+    return verdict, (said or lines or [""])[-1][:120]
 
 
 def main() -> None:
