@@ -1,6 +1,7 @@
 """Recordings: what is written is read back, by others too, and damage costs only what it hits."""
 
 import contextlib
+import itertools
 import random
 import struct
 import tracemalloc
@@ -640,3 +641,17 @@ def test_one_byte_of_the_beginning_may_be_damaged_but_the_version(tmp_path, dama
     else:
         with pytest.raises(InputError, match="not an MCAP recording"):
             open_recording(path)
+
+
+def test_played_again_labels_move_with_their_events(tmp_path):
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.write_label(Label(100, 50, "a"))
+        writer.write_events(make_events([1, 2], 0, 1, [110, 120]), RESOLUTION)
+    with open_recording(path) as recording:
+        items = list(itertools.islice(recording.played(loop=True), 6))
+    starts = [item.start_us for item in items if isinstance(item, Label)]
+    events = [int(item.events["t"][0]) for item in items if isinstance(item, Packet)]
+    assert starts[0] == 100
+    assert starts[1] > events[0]
+    assert [event - start for start, event in zip(starts, events, strict=True)] == [10, 10, 10]
