@@ -1,11 +1,11 @@
-"""Make `tests/golden/`: models, a classifier, recordings and a state, with the features they must give.
+"""Make `tests/golden/`: models, a classifier, recordings, a live job's state, and what they must give.
 
     python tests/make_golden.py tests/golden [--label TEXT]
 
 It uses public names and the command line alone, so that it runs at any commit: check that commit out,
-install it, and let its Python run this file. The files in the repository were made at commit 48b5f29,
-before the package was divided into rooms. Make them anew only where a format version changes on purpose,
-and say so in the commit.
+install it, and let its Python run this file. The files in the repository were made at commit 48b5f29, before
+the package was divided into rooms. Make them anew only where a format version changes on purpose, and say so
+in the commit.
 """
 
 import argparse

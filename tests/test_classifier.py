@@ -438,3 +438,16 @@ def test_an_unknown_label_is_refused():
         learner.learn_one(np.ones(N, np.float32), "fox")
     learner.flush()
     assert learner.learned == 0
+
+
+def test_a_tie_goes_to_the_smaller_c():
+    """Whatever order they are given in: the stronger regularisation of two that score the same."""
+    encoder = tiny.encoder()
+    rng = np.random.default_rng(0)
+    labels = ["a", "b"] * 12
+    rows = rng.standard_normal((24, encoder.n_features)).astype(np.float32)
+    rows[::2, :8] += 50
+    trained = train_classifier(rows, labels, encoder, candidates=(0.1, 10.0, 1.0), folds=2)
+    scores = trained.provenance["cross_validation"]
+    assert len(set(scores.values())) == 1
+    assert trained.provenance["C"] == 0.1

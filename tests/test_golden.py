@@ -1,4 +1,4 @@
-"""Files of commit 48b5f29 give the bits that they gave there: models, recordings, a classifier, a state.
+"""Models, recordings, a classifier and a state of commit 48b5f29 still give the bits that they gave there.
 
 `tests/make_golden.py` made them, and says how. Times and features are compared whole, by their digests.
 """
@@ -105,4 +105,14 @@ def test_a_file_of_another_format_version_is_refused_in_one_line(name, kind, loa
     with pytest.raises(InputError, match="format version 0") as error:
         load(path)
     assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "load"),
+    [("classifier", sf.Encoder.load), ("direct-split", sf.Classifier.load), ("direct-split", resumed)],
+)
+def test_a_file_of_another_kind_is_refused_in_one_line(name, load):
+    with pytest.raises(InputError, match=r"but not a .* file") as error:
+        load(of_model(name))
     assert "\n" not in str(error.value)

@@ -27,6 +27,8 @@ from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.stream.outputs import Outputs
 
+pytestmark = pytest.mark.real_time
+
 KEY = "cam/a/events"
 
 PUBLISHER = """

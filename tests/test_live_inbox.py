@@ -3,6 +3,8 @@
 import threading
 import time
 
+import pytest
+
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.stream.cameras import CameraLeft
 
@@ -46,6 +48,7 @@ def test_full_of_bytes_it_drops_the_oldest_and_tells_the_next_of_the_topic():
     assert inbox.take(0)[0] == CameraLeft("a")
 
 
+@pytest.mark.real_time
 def test_what_has_waited_too_long_is_dropped():
     inbox, now = Inbox(max_delay_s=1000.0), time.monotonic_ns()
     for i in range(10):
@@ -65,6 +68,7 @@ def test_a_message_larger_than_all_is_not_kept():
     assert inbox.take(0)[0].dropped == 1
 
 
+@pytest.mark.real_time
 def test_closing_wakes_who_waits_and_keeps_what_is_there():
     inbox, got = Inbox(), []
     thread = threading.Thread(target=lambda: got.append(inbox.take(30)))

@@ -41,6 +41,8 @@ from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.session import Session
 
+pytestmark = pytest.mark.real_time
+
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)
 WINDOW = MODEL.geometry.window_us

@@ -16,6 +16,8 @@ from streamfeat.live.network import FoundTopic, Network, find_topics
 from streamfeat.live.publish import PublishJob
 from streamfeat.stream.outputs import Outputs
 
+pytestmark = pytest.mark.real_time
+
 MODEL = tiny.encoder(k=3)
 HASH = "RIHS01_d6fa176260b1f37e5a40845305315e150a0f18191241eb64f407442aa29844aa"
 TYPE = "event_camera_msgs::msg::dds_::EventPacket_"

@@ -18,6 +18,8 @@ from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import Network, open_session
 
+pytestmark = pytest.mark.real_time
+
 RULES = """{
   mode: "peer",
   listen: { endpoints: ["tls/127.0.0.1:PORT"] },

@@ -140,6 +140,7 @@ def own(shard, names):
     return [name for name in names if shard.has(f"cam/{name}")]
 
 
+@pytest.mark.real_time
 def test_every_camera_is_served_exactly_once(files):
     """With labels, which go where their camera goes; what the others leave out is counted, and not lost."""
     port, names = free_port(), "abcdefgh"
@@ -189,6 +190,7 @@ def test_every_camera_is_served_exactly_once(files):
         assert len({publisher for _, publisher in served[name]}) == 1
 
 
+@pytest.mark.real_time
 def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
     """Each process asks for its own cameras alone; one that comes back later is heard again."""
     port, names = free_port(), "abcdef"
@@ -224,6 +226,7 @@ def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
         assert "other_shards_packets" not in result
 
 
+@pytest.mark.real_time
 def test_a_ros_camera_that_announces_itself_is_heard(files):
     port, sink, asked = free_port(), ListSink(), RosNames("/cam/*/events")
     job = ListenJob(
@@ -305,6 +308,7 @@ def ended(one):
     return json.loads(text)
 
 
+@pytest.mark.real_time
 def test_a_process_that_is_killed_and_started_again_takes_up_its_own_cameras(files, tmp_path):
     port, names = free_port(), "abcf"
     first, second = Shard(0, 2), Shard(1, 2)
@@ -345,6 +349,7 @@ def test_a_process_that_is_killed_and_started_again_takes_up_its_own_cameras(fil
     assert results[0]["lost"] == 0
 
 
+@pytest.mark.real_time
 def test_what_another_shard_serves_by_now_is_left_in_the_state(files, tmp_path):
     """Three shares where there were two: nobody goes on with a camera that is another's."""
     port, state, names = free_port(), tmp_path / "state", "abcf"

@@ -71,6 +71,7 @@ def counted(one):
     return sum(one[name] for name in ("packets", "lost", "dropped", "missed", "unheard"))
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("keeps_state", [False, True])
 def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, keeps_state):
     port, keys = free_port(), [f"robot/{i}/events" for i in range(4)]
@@ -113,6 +114,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
     assert len([line for line in lines if "again on worker" in line]) == len(mourned)
 
 
+@pytest.mark.real_time
 def test_topics_are_found_by_their_tokens_alone():
     port, found = free_port(), []
     with (
@@ -129,6 +131,7 @@ def test_topics_are_found_by_their_tokens_alone():
             until(lambda: set(ros) == {"/cam1/events", "/cam2/events"})
 
 
+@pytest.mark.real_time
 def test_one_camera_without_a_wildcard_needs_no_token_and_a_configuration_goes_along(two, model, tmp_path):
     port, config = free_port(), tmp_path / "client.json5"
     config.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]}}))

@@ -1,6 +1,7 @@
 """Recordings: what is written is read back, by others too, and damage costs only what it hits."""
 
 import contextlib
+import itertools
 import random
 import struct
 import tracemalloc
@@ -21,6 +22,7 @@ from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, make_decoder
 from streamfeat.messages.packets import PacketWriter
 from streamfeat.recordings import records as mcap_records
 from streamfeat.recordings.reader import WHOLE, Label, Packet, Topic, open_recording
+from streamfeat.recordings.samples import complete_samples
 from streamfeat.recordings.writer import RecordingWriter, recover
 
 RESOLUTION = (60, 80)
@@ -610,3 +612,46 @@ def test_recover_keeps_messages_as_they_are(tmp_path):
         with each.open("rb") as file:
             contents.append(list(make_reader(file, validate_crcs=True).iter_messages()))
     assert contents[0] == contents[1]
+
+
+def test_samples_that_are_open_at_a_time_are_bounded():
+    """A recording may claim samples without end: the oldest of 16 is given when one more begins."""
+    labels = [Label(i, 1_000_000, str(i)) for i in range(18)]
+    taken = []
+    items = ((0, taken.append(label) or label) for label in labels)
+    first = next(complete_samples(items, 1, RESOLUTION))
+    assert first.label == labels[0]
+    assert len(taken) == 17
+
+
+@pytest.mark.parametrize(
+    ("damaged", "is_read"), [((0,), True), ((0, 1), False), ((5,), False), ((2, 7), False)]
+)
+def test_one_byte_of_the_beginning_may_be_damaged_but_the_version(tmp_path, damaged, is_read):
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.write_events(make_events([1, 2], 0, 1, [3, 4]), RESOLUTION)
+    data = bytearray(path.read_bytes())
+    for at in damaged:
+        data[at] ^= 0x55
+    path.write_bytes(data)
+    if is_read:
+        with open_recording(path) as recording:
+            assert sum(map(len, recording)) == 2
+    else:
+        with pytest.raises(InputError, match="not an MCAP recording"):
+            open_recording(path)
+
+
+def test_played_again_labels_move_with_their_events(tmp_path):
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.write_label(Label(100, 50, "a"))
+        writer.write_events(make_events([1, 2], 0, 1, [110, 120]), RESOLUTION)
+    with open_recording(path) as recording:
+        items = list(itertools.islice(recording.played(loop=True), 6))
+    starts = [item.start_us for item in items if isinstance(item, Label)]
+    events = [int(item.events["t"][0]) for item in items if isinstance(item, Packet)]
+    assert starts[0] == 100
+    assert starts[1] > events[0]
+    assert [event - start for start, event in zip(starts, events, strict=True)] == [10, 10, 10]

@@ -440,6 +440,7 @@ def next_number(path):
     return topics[KEY]["delivery"]["next"] if KEY in topics else 0
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("reliable", [True, False])
 def test_a_listener_that_is_killed_goes_on_where_it_was(reliable, files, tmp_path):
     """What is put while nobody listens is recovered if both sides ask for it, or else lost and counted."""

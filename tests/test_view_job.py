@@ -141,6 +141,7 @@ def test_a_view_that_fails_leaves_no_file(files, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_a_recording_begins_when_somebody_looks_and_its_end_stays(files):
     lines = []
     view = View(
@@ -183,6 +184,7 @@ def moving(camera):
         thread.join()
 
 
+@pytest.mark.real_time
 def test_live_topics_are_shown_and_not_answered(files):
     key, lines = "robot/cam/events", []
     port = free_port()
@@ -209,6 +211,7 @@ def test_live_topics_are_shown_and_not_answered(files):
     assert view.result()["frames"] >= 1
 
 
+@pytest.mark.real_time
 def test_a_ros_camera_is_shown(files):
     names, port, lines = RosNames("/event_camera/events"), free_port(), []
     view = View(
@@ -326,6 +329,7 @@ def test_a_file_is_written_from_the_command_line(files, tmp_path):
     assert "exists already" in str(invoke(files / "samples.mcap", "-m", files / "model", "-o", out).exception)
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("looking", [False, True])
 def test_ctrl_c_ends_a_view(files, looking):
     command = [sys.executable, "-c", "from streamfeat.cli import main; main()", "view"]

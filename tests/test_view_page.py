@@ -103,6 +103,7 @@ def get(server, path, token=True, **headers):
     return response.status, response.read().decode()
 
 
+@pytest.mark.real_time
 def test_there_is_one_page_for_those_who_know_the_token(server):
     status, text = get(server, "/")
     assert status == 200
@@ -111,6 +112,7 @@ def test_there_is_one_page_for_those_who_know_the_token(server):
     assert get(server, "/", token=False)[0] == get(server, "/?token=guess", token=False)[0] == 403
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("path", ["/", "/stream"])
 @pytest.mark.parametrize(
     "headers",
@@ -133,6 +135,7 @@ def test_other_names_and_pages_of_other_origins_get_nothing(server, path, header
     assert "script" not in text
 
 
+@pytest.mark.real_time
 def test_a_browser_is_shown_the_latest_and_asks_for_what_makes_sense():
     asked, looked = [], []
     server = PageServer(page, 0, on_viewer=lambda: looked.append(1), on_asked=asked.append)
@@ -163,6 +166,7 @@ def test_a_browser_is_shown_the_latest_and_asks_for_what_makes_sense():
         server.close()
 
 
+@pytest.mark.real_time
 def test_no_more_than_sixteen_browsers_look(server):
     address = server.address.replace("http", "ws").replace("/?", "/stream?")
     with ExitStack() as looking:
@@ -179,6 +183,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert len(text) < 60_000
 
 
+@pytest.mark.real_time
 def test_a_browser_that_goes_is_nobodys_error(server, capfd):
     for _ in range(5):
         with socket.create_connection(("127.0.0.1", server.port)) as one:
@@ -187,6 +192,7 @@ def test_a_browser_that_goes_is_nobodys_error(server, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.real_time
 def test_a_web_port_in_use_is_one_clear_line(server):
     with pytest.raises(
         InputError, match=f"--web-port {server.port}: cannot listen there: Address already in use"
@@ -194,6 +200,7 @@ def test_a_web_port_in_use_is_one_clear_line(server):
         PageServer(page, server.port)
 
 
+@pytest.mark.real_time
 @needs_chromium
 def test_every_panel_is_drawn_and_only_we_are_asked(tab, tmp_path):
     with shown(tmp_path, tiny.labelled_items(6), emit="10ms", speed=1.0) as url:
@@ -219,6 +226,7 @@ def test_every_panel_is_drawn_and_only_we_are_asked(tab, tmp_path):
     }
 
 
+@pytest.mark.real_time
 @needs_chromium
 def test_pixels_are_those_of_the_stream(tab, tmp_path):
     event = tiny.stream([10_000])
@@ -234,6 +242,7 @@ def test_pixels_are_those_of_the_stream(tab, tmp_path):
     assert tab.problems == []
 
 
+@pytest.mark.real_time
 @needs_chromium
 def test_events_alone_fill_the_page_and_can_be_steered(tab, tmp_path):
     tiny.write_items(tmp_path / "rec.mcap", [tiny.packet(tiny.steady(0, 900_000, 3_000))])
@@ -266,6 +275,7 @@ def test_events_alone_fill_the_page_and_can_be_steered(tab, tmp_path):
     assert view.result()["lost"] == 0
 
 
+@pytest.mark.real_time
 @needs_chromium
 def test_a_page_without_anything_to_show_says_so(tab):
     server = PageServer(page, 0)
@@ -287,6 +297,7 @@ def test_a_page_without_anything_to_show_says_so(tab):
     assert not [problem for problem in tab.problems if "WebSocket" not in problem]
 
 
+@pytest.mark.real_time
 @needs_chromium
 def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
     server = PageServer(page, 0)
@@ -310,6 +321,7 @@ def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
         server.close()
 
 
+@pytest.mark.real_time
 @needs_chromium
 @pytest.mark.parametrize("pooling", [1, 2, 3])
 def test_each_cell_has_its_bars(tab, pooling):

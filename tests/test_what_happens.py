@@ -222,6 +222,7 @@ def test_finished_cells_that_find_no_room(tmp_path):
 # --- signals
 
 
+@pytest.mark.real_time
 def test_a_signal_before_anything_runs_waits_until_it_can_be_heard(tmp_path):
     """Between opening an output and writing to it."""
     sink = JsonLinesSink(tmp_path / "out")
@@ -269,6 +270,7 @@ def wait_for(condition, process):
         time.sleep(0.01)
 
 
+@pytest.mark.real_time
 def test_a_replay_ends_on_sigterm_as_on_ctrl_c(home, tmp_path):
     target = tmp_path / "out.jsonl"
     words = ["replay", home / "few.mcap", "-m", home / "model", "--speed", "0.01", "--json-lines", target]
@@ -285,6 +287,7 @@ LONG = ["--patch", 8, "--filters", 200, "--volumes", 8000, "--lambda0", 0.1, "--
 """More than a hundred iterations of a fifth of a second, with the digits that ship."""
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("command", ["learn", "convert"])
 def test_sigterm_ends_a_command_as_ctrl_c_does(command, home, tmp_path):
     """While it is at work, which would take much longer."""

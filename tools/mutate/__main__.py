@@ -5,8 +5,8 @@ Not here: the faults (`mutants`).
 
 Why neither mutmut nor cosmic-ray: they make thousands of mutants, each with a minute of compiling here, and
 numba keeps the machine code of a caller whose callee was changed, so that a mutant would be tried with the
-code of before. Here each mutant of a kernel starts with an empty cache of its own. That the tests pass
-without a mutant is for the suite to say; a test that fails anyway would count as one that noticed.
+code of before. Here each mutant of a kernel starts with an empty cache of its own. That tests pass without
+a mutant is for the suite to say; a test that fails anyway would count as one that noticed.
 """
 
 import argparse
@@ -58,10 +58,11 @@ def try_mutant(mutant: Mutant, tree: Path, caches: Path) -> tuple[str, str]:
         return "killed", f"no end after {LIMIT_S} s"
     finally:
         path.write_text(text)
-    said = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+    said = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
     # 1: tests failed; 2 and more: nothing was tried, which is no proof.
     verdict = {0: "survived", 1: "killed"}.get(done.returncode, "no test")
-    return verdict, (said or done.stdout.splitlines() or done.stderr.splitlines() or [""])[-1][:120]
+    return verdict, (said or lines or [""])[-1][:120]
 
 
 def main() -> None:

@@ -25,6 +25,7 @@ class Mutant(NamedTuple):
     tests: str
 
 
+INVARIANTS = "tests/test_kernels.py tests/test_invariants.py tests/test_engine.py"
 MARKING = "tests/test_kernels.py -k 'mark_dirty or update or settle'"
 INGEST = "tests/test_kernels.py -k 'count_event or advance_to_bin'"
 SESSION = "tests/test_session.py"
@@ -38,14 +39,14 @@ MUTANTS = [
         "kernels/update.py",
         "inside = volume < last or (volume == last and entry < last_entry)",
         "inside = volume < last",
-        MARKING,
+        INVARIANTS,
     ),
     Mutant(
         "mark_dirty takes every entry of that volume",
         "kernels/update.py",
         "(volume == last and entry < last_entry)",
         "volume == last",
-        MARKING,
+        INVARIANTS,
     ),
     Mutant(
         "settle keeps flags",
@@ -343,7 +344,7 @@ MUTANTS = [
         "recordings/reader.py",
         "start_us=item.start_us + shift_us",
         "start_us=item.start_us",
-        "tests/test_recording.py tests/test_pipeline.py",
+        "tests/test_recording.py -k played_again",
     ),
     Mutant(
         "losses of a part are not added",
@@ -358,14 +359,14 @@ MUTANTS = [
         "files/atomic.py",
         "        yield temporary\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(path)\n    finally:\n",
         "        yield temporary\n    finally:\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(path)\n",
-        "tests/test_full_disk.py tests/test_places.py",
+        "tests/test_atomic.py",
     ),
     Mutant(
         "sweep takes others' files",
         "files/atomic.py",
         r'rf"\.{re.escape(path.name)}\.[a-z0-9_]+{re.escape(_SUFFIX)}"',
         r'rf".*{re.escape(_SUFFIX)}"',
-        "tests/test_state.py -k killed_writer",
+        "tests/test_atomic.py",
     ),
     Mutant(
         "true is a number",
@@ -401,7 +402,7 @@ MUTANTS = [
         "classify/classifier.py",
         "best = max(scores, key=lambda c: (scores[c], -c))",
         "best = max(scores, key=lambda c: (scores[c], c))",
-        "tests/test_classifier.py",
+        "tests/test_classifier.py -k smaller_c",
     ),
     Mutant(
         "a tie goes to the larger power",

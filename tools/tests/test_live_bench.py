@@ -11,7 +11,7 @@ from tools.live_bench import faults
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = pytest.mark.flaky(reruns=2)  # real networks and processes, on machines that others share
+pytestmark = pytest.mark.real_time
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from tools.live_bench import workers
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = pytest.mark.flaky(reruns=2)  # real networks and processes, on machines that others share
+pytestmark = pytest.mark.real_time
 
 
 def test_another_serves_the_cameras_of_a_worker_that_is_killed(tmp_path):
