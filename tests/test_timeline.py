@@ -25,7 +25,7 @@ from streamfeat.recordings.records import Block
 from streamfeat.recordings.sources import StoredMessage
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import _Pace
+from streamfeat.stream.pacing import Pace
 from streamfeat.stream.session import Session
 
 HEIGHT, WIDTH = 48, 64
@@ -407,7 +407,7 @@ def test_labels_of_a_looped_recording_are_shifted(tmp_path):
 
 @pytest.mark.parametrize("again_us", [0, 1 << 50])
 def test_a_jump_of_the_clock_neither_waits_nor_bursts(again_us):
-    pace, now_s, dues = _Pace(2.0), 100.0, []
+    pace, now_s, dues = Pace(2.0), 100.0, []
     for epoch, start_us in enumerate([5_000_000, again_us]):
         for i in range(5):
             t_us = start_us + 100_000 * i

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from streamfeat.engine.engine import Engine, EngineStats
 from streamfeat.events import Events, Resolution
 
-__all__ = ["ObservedEngine", "Pace", "Sight", "Slot", "Updates", "Watch"]
+__all__ = ["ObservedEngine", "Sight", "Slot", "Throttle", "Updates", "Watch"]
 
 _KEPT_EVENTS = 1 << 18
 """Events that a picture can be made of; more than a sensor shows in one bin, and 4 MB."""
@@ -70,7 +70,7 @@ class Sight:
     updates: Updates
 
 
-class Pace:
+class Throttle:
     """So many times a second, of the clock or of the stream.
 
     Args:
@@ -119,7 +119,7 @@ class Watch:
     """How the engines of one camera are watched: what they are called, how often, who is told."""
 
     topic: str
-    pace: Pace
+    throttle: Throttle
     see: Callable[[Sight], None]
 
 
@@ -191,7 +191,7 @@ class ObservedEngine(Engine):
     def _look(self) -> None:
         window_us = self.window_us
         now_us = min(max(self._now_us, self._latest_us()), window_us[1])
-        if not self._watch.pace.is_due(now_us):
+        if not self._watch.throttle.is_due(now_us):
             return
         took = np.array(self._took_us or [0.0])
         updates = Updates(self._n_updates, float(np.median(took)), float(took.max()))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.stream.emission import Emission
-from streamfeat.view.observe import Pace, Sight, Slot, Watch
+from streamfeat.view.observe import Sight, Slot, Throttle, Watch
 from streamfeat.view.pictures import bins_picture, event_picture, feature_columns, volume_picture
 from streamfeat.view.tap import EventTap, RecentEvents
 
@@ -64,7 +64,7 @@ class ViewSink:
         self._prefix = prefix
         self._drops = drops
         self._slots: dict[str, Slot] = {}
-        self._paces: dict[str, Pace] = {}
+        self._throttles: dict[str, Throttle] = {}
         self._judged: dict[str, list[int]] = {}
         self.frames = 0
 
@@ -75,17 +75,17 @@ class ViewSink:
 
     def tap(self) -> EventTap:
         """What the items of the stream pass through on their way to the engines."""
-        return EventTap(self._pace, self._show_events)
+        return EventTap(self._throttle, self._show_events)
 
     def watch(self, topic: str) -> Watch:
         """How to watch the engines of a camera."""
         if self._live:
             slot = self._slots.setdefault(topic, Slot())
-            return Watch(topic, self._pace(), slot.put)
-        return Watch(topic, self._pace(), self._draw)
+            return Watch(topic, self._throttle(), slot.put)
+        return Watch(topic, self._throttle(), self._draw)
 
-    def _pace(self) -> Pace:
-        return Pace(self._rate) if self._live else Pace(self._rate, clock=None)
+    def _throttle(self) -> Throttle:
+        return Throttle(self._rate) if self._live else Throttle(self._rate, clock=None)
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Show what is due, and the emission at the end of each sample, which is the one that is scored."""
@@ -109,7 +109,7 @@ class ViewSink:
         """Do nothing; boards are closed where they were opened."""
 
     def _is_due(self, e: Emission) -> bool:
-        return self._paces.setdefault(e.topic, Pace(self._rate, clock=None)).is_due(e.t_us)
+        return self._throttles.setdefault(e.topic, Throttle(self._rate, clock=None)).is_due(e.t_us)
 
     def _show_events(self, seen: RecentEvents) -> None:
         window_us = seen.now_us - seen.seen_us, seen.now_us + 1

@@ -14,7 +14,7 @@ from typing import TypeVar
 from streamfeat.events import Events, Resolution
 from streamfeat.messages.packets import Packet
 from streamfeat.stream.cameras import MAX_CAMERAS
-from streamfeat.view.observe import Pace
+from streamfeat.view.observe import Throttle
 
 __all__ = ["EventTap", "RecentEvents"]
 
@@ -55,8 +55,8 @@ class RecentEvents:
 class _Recent:
     """The latest events of one camera."""
 
-    def __init__(self, pace: Pace) -> None:
-        self.pace = pace
+    def __init__(self, throttle: Throttle) -> None:
+        self.throttle = throttle
         self.epoch = 0
         self.events = self.frame = 0
         self._batches: deque[Events] = deque()
@@ -90,7 +90,7 @@ class _Recent:
             self._since = self._now_us, self.events
 
     def due(self, packet: Packet, seen_us: int) -> RecentEvents | None:
-        if not self.pace.is_due(self._now_us):
+        if not self.throttle.is_due(self._now_us):
             return None
         batches = tuple(self._batches)
         if self._kept > _KEPT_EVENTS:  # a single long packet
@@ -112,13 +112,13 @@ class EventTap:
     """Looks at the packets of a stream as they pass.
 
     Args:
-        make_pace: how often there is a picture of a camera.
+        make_throttle: how often there is a picture of a camera.
         see: told what it is made of; in the thread that iterates.
     """
 
-    def __init__(self, make_pace: Callable[[], Pace], see: Callable[[RecentEvents], None]) -> None:
+    def __init__(self, make_throttle: Callable[[], Throttle], see: Callable[[RecentEvents], None]) -> None:
         """Nothing has passed."""
-        self._make_pace, self._see = make_pace, see
+        self._make_throttle, self._see = make_throttle, see
         self._cameras: dict[str, _Recent] = {}
         self.seen_us = _SEEN_US
 
@@ -134,7 +134,7 @@ class EventTap:
         if recent is None:
             if len(self._cameras) >= MAX_CAMERAS:
                 del self._cameras[next(iter(self._cameras))]
-            recent = self._cameras[packet.topic] = _Recent(self._make_pace())
+            recent = self._cameras[packet.topic] = _Recent(self._make_throttle())
         recent.add(packet, self.seen_us)
         seen = recent.due(packet, self.seen_us)
         if seen is not None:

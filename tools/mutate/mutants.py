@@ -270,16 +270,16 @@ MUTANTS = [
     ),
     Mutant(
         "mono: polarity of the wrong bit",
-        "messages/codecs.py",
-        "words >> 48 & 0x7FFF, words >> 63, t)",
-        "words >> 48 & 0x7FFF, words >> 62 & 1, t)",
+        "kernels/decode.py",
+        "out[i].p = word >> 63",
+        "out[i].p = (word >> 62) & 1",
         "tests/test_codecs.py",
     ),
     Mutant(
         "mono: nanoseconds of the base are dropped",
-        "messages/codecs.py",
-        "(time_base_ns % 1000 + dt_ns) // 1000",
-        "dt_ns // 1000",
+        "kernels/decode.py",
+        "(rest_ns + np.int64(word & 0xFFFFFFFF)) // 1000",
+        "np.int64(word & 0xFFFFFFFF) // 1000",
         "tests/test_codecs.py",
     ),
     Mutant(
