@@ -61,7 +61,7 @@ __all__ = [
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "train", "replay", "evaluate", "latency", "view")
+_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
