@@ -158,9 +158,10 @@ def ecf(events: Events, mode: int) -> bytes:
         n = 1
         while i + n < len(t) and t[i + n] == t[i]:
             n += 1
-        out.append(t[i] - now << 4 | min(n, 15))
+        out.append(max(t[i] - now, 0) << 4 | min(n, 15))  # a fall cannot be written
+
         out.extend(n.to_bytes(2, "little") if n >= 15 else b"")
-        now, i = t[i], i + n
+        now, i = max(t[i], now), i + n
     if mode == 2:
         groups([b << 12 | a << 1 | c for a, b, c in zip(x, y, p, strict=True)], 24)
         return bytes(out)
