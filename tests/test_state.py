@@ -78,7 +78,7 @@ def test_an_engine_that_is_restored_anywhere_goes_on_with_the_same_bits(kind, da
 
 @pytest.mark.parametrize("kind", LASSO_KINDS, ids="-".join)
 def test_engines_that_look_ahead_go_on_from_the_codes_of_a_snapshot_alone(kind):
-    """A lasso that the other plane has solved before would be where the next one starts, in one of the two."""
+    """A lasso that the other plane has solved before would be where the next starts, in one of them."""
     geometry = Geometry(patch=3, stride=2, n_bins=3, bin_us=1000, max_count=2)
     for seed in range(4):
         rng = np.random.default_rng(seed)
