@@ -26,7 +26,7 @@ ROOMS = {
     "messages": {"errors", "events", "files", "kernels"},
     "denoise": {"errors", "events", "kernels", "messages"},
     "simulate": {"events"},
-    "camera_files": {"errors", "events", "files", "messages"},
+    "camera_files": {"errors", "events", "files", "kernels", "messages"},
     "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
     "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
