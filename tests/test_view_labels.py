@@ -12,6 +12,7 @@ import pytest
 import tiny
 from browser import Browser, find_chromium
 from live_net import PATIENCE_S, until
+from test_json import check
 from websockets.sync.client import connect
 
 from streamfeat.errors import InputError
@@ -318,6 +319,7 @@ def test_the_command_saves_and_writes_a_recording_when_it_is_interrupted(recordi
         process.kill()
         process.communicate()
     result = json.loads(text)
+    check("label", result)
     assert process.returncode == 0, errors
     assert result["samples"] == len(read_labels(recording.parent / "drive.labels.csv").labels) == 2
     with open_recording(tmp_path / "out.mcap") as rec:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import tiny
 from live_net import ListSink, compiled, free_port, running, until
+from test_json import check
 
+from streamfeat.cli.results import complete
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import Network
@@ -43,6 +45,7 @@ def test_from_ones_own_camera_to_a_live_classifier(run, tmp_path):
     with running(recorder):
         packets = publish(scene, port)["packets"]
         until(lambda: recorder.result()["messages"] == packets, "all packets")
+    check("record", complete("record", recorder.result()))
     with open_recording(drive) as rec:
         assert not rec.is_labelled
 
@@ -89,6 +92,7 @@ def test_from_ones_own_camera_to_a_live_classifier(run, tmp_path):
     with running(listener, Outputs(more=sink)):
         packets = publish(scene, port)["packets"]
         until(lambda: listener.result()["packets"] == packets, "all packets")
+    check("listen", complete("listen", listener.result()))
     assert listener.result()["lost"] == listener.result()["dropped"] == 0
     at = np.array([emission.t_us for emission in sink.emissions])
     right = 0

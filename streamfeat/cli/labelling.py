@@ -103,4 +103,4 @@ def label(
             )
         print_losses(done.losses)
     result["written"] = str(mcap) if mcap and result["labels"] is not None else None
-    print_result(result, str(recording), as_json=as_json)
+    print_result(result, str(recording), as_json=as_json, command="label")

@@ -5,7 +5,6 @@ Not here: the measurements (`latency`).
 """
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,6 +26,7 @@ from streamfeat.cli.program import (
     completing,
     err,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
 )
@@ -111,7 +111,7 @@ def latency(
     except KeyboardInterrupt:  # before there is anything to show, or for the second time
         raise typer.Exit(130) from None
     if as_json:
-        typer.echo(json.dumps(report.result()))
+        print_json("latency", report.result())
     else:
         _print(report)
     if plot and report.rows:
