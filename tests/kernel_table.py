@@ -503,6 +503,7 @@ def make_groups(rng):
     bits = int(pick(rng, [12, 24]))
     return data, int(rng.integers(0, 125)), 3, bits, np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
 
+
 def random_length(rng, most):
     """Of a batch, which is often enough empty."""
     return 0 if rng.random() < 0.1 else int(rng.integers(1, most))
