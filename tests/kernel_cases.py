@@ -145,7 +145,7 @@ ECF = {
     "runs of rows, columns in groups": lambda call: call.data[0] & 3 == 1 and call.result > 0,
     "pixels in groups": lambda call: call.data[0] & 2 != 0 and call.result > 0,
     "damaged or cut": lambda call: call.result < 0,
-    "the first time is a long step": lambda call: call.result > 0 and call.data[12] >> 4 == 15,
+    "the second time is a long step": lambda call: call.result > 0 and call.data[13] >> 4 == 15,
     "the first run of times is long": lambda call: call.result > 0 and call.data[12] % 16 == 15,
 }
 
