@@ -318,23 +318,6 @@ def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
         assert "cut short" in cut.damage[0]
 
 
-def ecf_file(h5py, path, chunks, *, n=None, is_shuffled=False):
-    """A file of Metavision: a table whose chunks of 250 events are stored as they are given."""
-    with h5py.File(path, "w") as root:
-        filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        filters.set_chunk((250,))
-        if is_shuffled:
-            filters.set_shuffle()
-        filters.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
-        space = h5py.h5s.create_simple((n or 250 * len(chunks),))
-        kind = h5py.h5t.py_create(SCENE.dtype)
-        table = h5py.h5d.create(root.create_group("CD").id, b"events", kind, space, filters)
-        for i, chunk in enumerate(chunks):
-            table.write_direct_chunk((250 * i,), chunk)
-        root.attrs["geometry"] = "64x48"
-    return path
-
-
 class TestHdf5:
     @pytest.fixture
     def h5py(self):
@@ -384,7 +367,9 @@ class TestHdf5:
 
     @pytest.mark.parametrize("mode", [0, 1, 2])
     def test_ecf_of_prophesee_in_every_packing(self, tmp_path, h5py, mode):
-        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)])
+        path = scenes.ecf_file(
+            h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)]
+        )
         file = open_events(path)
         np.testing.assert_array_equal(np.concatenate([*file]), SCENE[:500])
         assert (file.declared, file.damage, len([*file])) == ((48, 64), [], 2)
@@ -392,20 +377,20 @@ class TestHdf5:
     def test_the_last_chunk_of_ecf_holds_more_than_the_table(self, tmp_path, h5py):
         padded = np.concatenate([SCENE[250:400], np.zeros(100, SCENE.dtype)])  # as the HDF5 library writes it
         chunks = [scenes.ecf(SCENE[:250], 2), scenes.ecf(padded, 2)]
-        path = ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
         np.testing.assert_array_equal(read_events(path).events, SCENE[:400])
 
     @pytest.mark.parametrize("cut", [4, 11, 12, 300, 700])
     def test_ecf_that_is_cut_short_keeps_the_chunks_before(self, tmp_path, h5py, cut):
         chunks = [scenes.ecf(SCENE[:250], 1), scenes.ecf(SCENE[250:500], 1)[:cut]]
-        cut_short = read_events(ecf_file(h5py, tmp_path / "a.h5", chunks))
+        cut_short = read_events(scenes.ecf_file(h5py, tmp_path / "a.h5", chunks))
         np.testing.assert_array_equal(cut_short.events, SCENE[:250])
         assert "after event 250 is lost: a chunk of ECF" in cut_short.damage[0]
         with pytest.raises(InputError, match="damaged: a chunk of ECF"):
-            open_events(ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
+            open_events(scenes.ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
 
     def test_ecf_together_with_another_filter_is_refused(self, tmp_path, h5py):
-        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
         with pytest.raises(InputError, match="with this filter alone"):
             open_events(path)
 
