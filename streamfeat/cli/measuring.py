@@ -86,7 +86,7 @@ def latency(
 
     if plot:
         check_picture(plot)
-        refuse_existing(plot, overwrite=overwrite)
+        refuse_existing(plot, recording, *models, overwrite=overwrite)
     report = LatencyReport(
         recording,
         models,
