@@ -133,7 +133,7 @@ def evaluate(
         raise InputError(f"--early-samples {early_samples} is not possible; give 0 or more")
     for path in (output, page):
         if path:
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
     base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel, "model": str(model or "")}
