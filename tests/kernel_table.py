@@ -9,6 +9,7 @@ from typing import Any
 
 import naive
 import numpy as np
+from camera_files_scene import ecf
 from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random_events
 
 from streamfeat.engine.engine import Engine
@@ -21,6 +22,7 @@ from streamfeat.kernels import (
     decode,
     denoise,
     encode,
+    file_codes,
     follow,
     ingest,
     lasso,
@@ -29,6 +31,7 @@ from streamfeat.kernels import (
     update,
     volume,
 )
+from streamfeat.kernels.file_codes import ECF_PADDING
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
@@ -471,6 +474,35 @@ def make_time_span(rng):
     events["x"], events["y"] = rng.integers(0, 12, len(events)), rng.integers(0, 12, len(events))
     events["t"] = rng.integers(-(2**62), 2**62, len(events))
     return events, int(rng.integers(1, 12)), int(rng.integers(1, 12)), np.array([7, 7])
+
+
+def make_event_stream(rng):
+    data = rng.integers(0, 256, int(rng.integers(0, 80)), np.uint8)
+    data[rng.random(len(data)) < 0.3] |= 0xFC
+    state = np.array([*rng.integers(0, 2**40, 2), 0])
+    return data, bool(rng.random() < 0.5), state, np.zeros(len(data) // 5, EVENT_DTYPE)
+
+
+def make_ecf(rng):
+    n = int(rng.integers(0, 60))
+    events = np.zeros(n, EVENT_DTYPE)
+    steps = rng.choice([0, 0, 1, 14, 15, 16, 300_000], n) * (rng.random() < 0.8)
+    events["t"] = np.cumsum(steps) + int(rng.integers(0, 2**40))
+    events["y"] = np.repeat(rng.integers(0, 2048, n), int(pick(rng, [1, 3, 40])))[:n]
+    events["x"] = np.minimum(np.cumsum(rng.choice([1, 1, 2, 7], n)), 2047)
+    events["p"] = np.repeat(rng.integers(0, 2, n), int(pick(rng, [1, 2, 130])))[:n]
+    data = np.frombuffer(ecf(events, int(pick(rng, [0, 1, 2]))), np.uint8).copy()
+    if rng.random() < 0.3:
+        data = data[: int(rng.integers(12, len(data) + 1))]
+    if rng.random() < 0.3:
+        data[int(rng.integers(4, len(data)))] = rng.integers(0, 256)
+    return np.concatenate([data, np.zeros(ECF_PADDING, np.uint8)]), len(data), np.zeros(n, EVENT_DTYPE)
+
+
+def make_groups(rng):
+    data = rng.integers(0, 256, 140, np.uint8)
+    bits = int(pick(rng, [12, 24]))
+    return data, int(rng.integers(0, 125)), 3, bits, np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
 
 
 def random_length(rng, most):
@@ -1008,6 +1040,9 @@ KERNELS = [
     Row(decode.decode_mono, make_mono),
     Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
+    Row(file_codes.decode_event_stream, make_event_stream),
+    Row(file_codes.decode_ecf, make_ecf, exact_unless_refused),
+    Row(file_codes.decode_groups, make_groups, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),
     Row(ingest.start_of_bin, make_start_of_bin),
