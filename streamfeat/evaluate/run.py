@@ -27,7 +27,6 @@ from streamfeat.evaluate.scores import (
 )
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files.atomic import write_atomically
-from streamfeat.files.locations import size_of
 from streamfeat.report.machine import describe_machine
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
@@ -153,12 +152,11 @@ def evaluate(
     header = {
         "format": "streamfeat-evaluate",
         "version": _VERSION,
-        "recordings": [[path.name, size_of(path)] for path in data.paths],
         "folds": data.n_folds,
         "scored": data.scored,
         "groups": data.groups,
         "early_samples": early_samples,
-    }
+    } | data.identity
     kept = StateFile(state, header)
     leakage = check_leakage(data, report, workers)
     rows: list[dict[str, Any]] = []
