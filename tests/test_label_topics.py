@@ -10,7 +10,7 @@ from test_timeline import HEIGHT, HOST_NS, STEP_US, WIDTH, messages, moving_dot
 
 from streamfeat.errors import InputError
 from streamfeat.messages.cdr import EventPacket
-from streamfeat.messages.text_messages import TEXT_SCHEMAS, parse_text
+from streamfeat.messages.text_messages import parse_text
 from streamfeat.recordings.options import ReadOptions
 from streamfeat.recordings.reader import open_recording
 
