@@ -72,9 +72,9 @@ def label(
 
     path = output or label_path(str(recording))
     if mcap:
-        refuse_existing(mcap, overwrite=overwrite)
+        refuse_existing(mcap, recording, path, overwrite=overwrite)
     if not path.exists():
-        refuse_existing(path, overwrite=False)
+        refuse_existing(path, recording, overwrite=False)
     with open_recording(recording, topic, reading) as rec:
         print_assumptions(rec.assumptions)
         sheet = LabelSheet(rec, path, [name for name in classes.split(",") if name.strip()])

@@ -27,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     print_losses,
     print_result,
     progress_bars,
@@ -106,7 +107,7 @@ def learn(
     from streamfeat.learn.settings import Setting
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(model, overwrite=overwrite or model == resume)
+    refuse_existing(model, *recordings, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
@@ -183,8 +184,8 @@ def _keeper(path: Path) -> "Keep":
 def train(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
-    model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
+    model: ModelOption = None,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
@@ -207,11 +208,11 @@ def train(
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(classifier, overwrite=overwrite)
+    refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
-    encoder = Encoder.load(model)
+    encoder = Encoder.load(model_or_general(model))
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:

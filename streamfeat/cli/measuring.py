@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     out,
     print_json,
     progress_bars,
@@ -50,8 +51,14 @@ def latency(
     recording: RecordingArgument,
     reading: "ReadOptions",
     models: Annotated[
-        list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
-    ],
+        list[Path] | None,
+        typer.Option(
+            "--model",
+            "-m",
+            help="Model, from `streamfeat learn`; may be repeated.",
+            show_default="the general one",
+        ),
+    ] = None,
     emit: Annotated[
         list[str],
         typer.Option(
@@ -86,10 +93,10 @@ def latency(
 
     if plot:
         check_picture(plot)
-        refuse_existing(plot, overwrite=overwrite)
+        refuse_existing(plot, recording, *(models or ()), overwrite=overwrite)
     report = LatencyReport(
         recording,
-        models,
+        models or [model_or_general(None)],
         emit,
         topic=topic,
         reading=reading,

@@ -30,6 +30,7 @@ from typer.core import TyperGroup
 
 from streamfeat.cli.results import RESULTS, complete, for_people
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import is_replaced, refuse_input
 from streamfeat.files.locations import Location, location_of
 
 if TYPE_CHECKING:
@@ -154,7 +155,10 @@ SpeedOption = Annotated[
         help="1 is the recorded pace, 2 twice that, or max.", autocompletion=completing("1", "2", "max")
     ),
 ]
-ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]
@@ -277,6 +281,19 @@ def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterato
         yield found
 
 
+def model_or_general(model: Path | None) -> Path:
+    """The model that was given; without one the general model, which is said on standard error."""
+    from streamfeat.shipped.general import GENERAL_MODEL
+
+    if model is None:
+        err.print(
+            "[dim]model:[/] the general one that ships; filters learned from your own recordings fit them "
+            "better: `streamfeat learn`, then -m",
+            soft_wrap=True,
+        )
+    return model or GENERAL_MODEL
+
+
 def print_losses(losses: "Losses") -> None:
     """Say what of a recording could not be read."""
     for reason, count in losses.counts.items():
@@ -312,11 +329,10 @@ def print_json(command: str, result: dict[str, Any]) -> None:
     typer.echo(json.dumps(complete(command, result), allow_nan=False))
 
 
-def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file unless asked to, before any work is done."""
-    if path.exists() and not overwrite:
+def refuse_existing(path: Path, *inputs: object, overwrite: bool) -> None:
+    """Refuse to replace a file unless asked to, and an input in any case, before any work is done."""
+    refuse_input(path, inputs)
+    if is_replaced(path) and path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; give another name or --overwrite")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the name of a file")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")

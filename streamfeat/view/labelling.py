@@ -189,7 +189,7 @@ class LabelSheet:
                 f"{path}: holds labels of another recording, {known.partition(': ')[0]}; give another file "
                 "with -o"
             )
-        shift_us = self._first_us if table.is_relative else 0
+        shift_us = self._first_us if table.clock == "first" else 0
         return tuple(self._placed(table, shift_us))
 
     def _placed(self, table: LabelTable, shift_us: int) -> Iterable[Label]:
