@@ -6,13 +6,14 @@ Not here: the commands.
 
 import contextlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -65,6 +66,8 @@ __all__ = [
 ]
 
 _ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
+_PIPE_COLUMNS = 1_000
+_PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
@@ -92,8 +95,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-out = Console(highlight=False, emoji=False)
-err = Console(stderr=True, highlight=False, emoji=False)
+
+class _WholeConsole(Console):
+    """A console that cuts nothing where it is no terminal: what reads a pipe or a file has room."""
+
+    @property  # type: ignore[misc]
+    def size(self) -> ConsoleDimensions:
+        size = super().size
+        cuts = self.is_terminal or "COLUMNS" in os.environ
+        return size if cuts else ConsoleDimensions(_PIPE_COLUMNS, size.height)
+
+
+out = _WholeConsole(highlight=False, emoji=False)
+err = _WholeConsole(stderr=True, highlight=False, emoji=False)
 
 
 @app.callback()

@@ -80,8 +80,10 @@ RESULTS: dict[str, dict[str, Field]] = {
         "events": Field("int", "events that can be used"),
         "on": Field("int", "ON events", "ON"),
         "off": Field("int", "OFF events", "OFF"),
-        "first_us": Field("int?", "stream time of the earliest event; null without events"),
-        "duration_s": Field("number", "from the earliest to the latest event"),
+        "first_us": Field(
+            "int?", "stream time of the earliest event; null without events", "first event, us"
+        ),
+        "duration_s": Field("number", "from the earliest to the latest event", "duration, s"),
         "events_per_s": Field("int", "their ratio", "events a second"),
         "samples": Field("int", "labels", "labelled samples", quiet=True),
         "labels": Field("[text]", "names of the classes, sorted"),
@@ -325,6 +327,8 @@ def for_people(result: Mapping[str, Any], fields: Mapping[str, Field]) -> list[t
 def _text(name: str, value: Any) -> str:
     if name == "resolution":
         return f"{value[1]}x{value[0]}"
+    if isinstance(value, Mapping) and "schema" in value:
+        return f"{value['name']} ({value['schema']}, {value['messages']:,} messages)"
     if name == "objective":
         return f"{value[0]:.6g} to {value[-1]:.6g}"
     if isinstance(value, bool):
