@@ -22,6 +22,7 @@ from streamfeat.classify.features import encode_samples
 from streamfeat.demo.terminal import EventPicture, TerminalView
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.settings import Setting
@@ -188,18 +189,7 @@ def _use_kernels(encoder: Encoder) -> None:
 def _compile_kernels() -> None:
     """What kernels are compiled for are types: an encoder that has learned nothing does."""
     geometry = Geometry(patch=_SETTING.patch, n_bins=1, bin_us=1_000)
-    d = geometry.patch**2
-    _use_kernels(
-        Encoder.build(
-            geometry,
-            formulation="direct",
-            encoding="split",
-            threshold=0.1,
-            filters=np.eye(2, d, dtype=np.float32),
-            whitening=np.eye(d, dtype=np.float32),
-            mean=np.zeros(d, np.float32),
-        )
-    )
+    _use_kernels(random_encoder(0, geometry, 2, encoding="split"))
 
 
 class _Watched:

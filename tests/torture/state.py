@@ -14,6 +14,7 @@ import numpy as np
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events, make_events
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
@@ -93,19 +94,8 @@ def state(trials: Trials) -> list[Row]:
 
 
 def _encoder(seed: int) -> Encoder:
-    rng = np.random.default_rng(seed)
     geometry = Geometry(patch=8, stride=4, n_bins=3, bin_us=33_334, max_count=2)
-    d = geometry.entries
-    filters = rng.standard_normal((16, d)) / np.sqrt(d)
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.3,
-        filters=filters,
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
+    return random_encoder(seed, geometry, 16, encoding="split", threshold=0.3)
 
 
 def _sent(i: int) -> Events:
