@@ -105,9 +105,9 @@ def prepare(
 ) -> Material:
     """Sample volumes and learn their whitening; samples of held-out splits are not looked at.
 
-    Recordings are read once, in parts, for a sample of volumes, which is kept as small integers:
-    `volumes * d` bytes. No float copy of it is made. Without `window_ms` and `geometry` labels have to be
-    known first: that is one pass more.
+    Events are read and decoded once, in parts, for a sample of volumes, which is kept as small integers:
+    `volumes * d` bytes. No float copy of it is made. Without `window_ms` and `geometry`, labels are read
+    first, without decoding events.
 
     Args:
         recordings: open recordings.
@@ -172,7 +172,7 @@ def _openers(recordings: Sequence[Recording]) -> Iterator[tuple[Callable[[], Rec
 
 def _labels(opener: Callable[[], Recording], number: int) -> list[Label]:
     with opener() as recording:
-        return recording.labels
+        return [*recording.stored_labels()]
 
 
 def _sample_part(
@@ -200,7 +200,7 @@ def learn_encoder(
     (`provenance["interrupted"]`).
 
     Args:
-        recordings: open recordings; read as often as `prepare` says.
+        recordings: open recordings; their events are decoded once.
         setting: geometry and learning; iterations are those beyond `resume`.
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.

@@ -10,6 +10,7 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -302,6 +303,18 @@ class Recording(Shown):
     def labels(self) -> list[Label]:
         """All labels in stored order; the first use reads the whole file, as for the counts below."""
         return self._totals.labels
+
+    def stored_labels(self) -> Iterator[Label]:
+        """Yield the labels of this part, without its events; those that cannot be read are left out."""
+        if self._labels is not None:
+            yield from self.labels  # they are put into the stream by its times
+        elif self.is_labelled:
+            for at, stored in self._source.read(self.topic, self._part, Losses()):
+                if at >= self._part.end:
+                    return
+                if isinstance(stored, StoredMessage) and stored.schema == LabelMessage.SCHEMA_NAME:
+                    with suppress(InputError):
+                        yield Label.from_cdr(unpacked_message(stored.data))
 
     @property
     def n_on(self) -> int:
