@@ -246,7 +246,7 @@ class Rows:
             columns: t, x, y, p, each `(n,)` numbers, not changed.
 
         Raises:
-            InputError: a value is none that an event can have.
+            InputError: a value is out of the range that events have.
         """
         t = _microseconds(columns["t"], self._unit)
         # Fractions stay, to be refused below, and whole numbers whole.

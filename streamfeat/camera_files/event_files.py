@@ -55,7 +55,7 @@ FORMATS = {
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
     "text": "text .txt/.csv (t x y p)",
 }
-"""What can be read, by the name that `open_events` takes."""
+"""Formats that can be read, by the name that `open_events` takes."""
 
 EXTENSIONS = frozenset(
     [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".es", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]

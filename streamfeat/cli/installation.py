@@ -1,4 +1,4 @@
-"""What this installation is, what it lacks, and whether it computes what it should, how fast.
+"""The state of this installation: versions, missing extras, exactness and speed.
 
 Lives here: versions against what the package asks for, extras, threads, kernels, a second of work.
 Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
@@ -38,7 +38,7 @@ EXTRAS = {
     "test": "the tests",
     "lint": "lint and types",
 }
-"""What each extra is for."""
+"""The purpose of each extra."""
 
 _VECTORS = ("sse4.2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "neon", "sve")
 _FILTERS = 400

@@ -40,7 +40,7 @@ from streamfeat.stream.warming import warm_up
 __all__ = ["FILES", "Demo"]
 
 FILES = ("train.mcap", "test.mcap", "model", "classifier")
-"""What the demonstration writes."""
+"""Files that the demonstration writes."""
 
 SIZES = {"train": 200, "test": 40}
 """Digits of each recording."""
@@ -64,7 +64,7 @@ class Demo:
     """
 
     def __init__(self, folder: Path, report: Report = lambda step, done, total, remark: None) -> None:
-        """Nothing is written before `simulate`."""
+        """Write nothing before `simulate`."""
         self.train, self.test, self.model, self.classifier = (folder / name for name in FILES)
         self._report = report
         self._compiler: BaseProcess | None = None
@@ -168,7 +168,7 @@ class Demo:
         }
 
     def commands(self) -> list[str]:
-        """What to try next, as a shell takes it."""
+        """Commands to try next, quoted for a shell."""
         train, test, model, classifier = (
             shlex.quote(str(path)) for path in (self.train, self.test, self.model, self.classifier)
         )
@@ -187,7 +187,7 @@ def _use_kernels(encoder: Encoder) -> None:
 
 
 def _compile_kernels() -> None:
-    """What kernels are compiled for are types: an encoder that has learned nothing does."""
+    """Compile by an encoder that has learned nothing: kernels are compiled for types, not for values."""
     geometry = Geometry(patch=_SETTING.patch, n_bins=1, bin_us=1_000)
     _use_kernels(random_encoder(0, geometry, 2, encoding="split"))
 

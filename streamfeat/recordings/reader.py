@@ -164,7 +164,7 @@ class Recording(Shown):
         return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
-        """What opens some of this recording, wherever that is called, and can be pickled."""
+        """A function that opens a part of this recording; it can be pickled and called on any machine."""
         return partial(Recording, _wherever(self._given), self.topic, part, self._options)
 
     def items(self) -> Iterator[Packet | Label]:
@@ -242,7 +242,7 @@ class Recording(Shown):
 
     @property
     def counts(self) -> Counter[str]:
-        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        """Counts of packets and of their times in the latest pass, see `Timeline.counts`."""
         return self._timeline.counts
 
     def played(
@@ -372,7 +372,7 @@ def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
-    """The same files, whatever folder somebody works in."""
+    """The same files, whatever the working directory."""
     if isinstance(path, str) or not isinstance(path, Sequence):
         return absolute(location_of(path))
     return [absolute(location_of(one)) for one in path]

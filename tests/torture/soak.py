@@ -112,10 +112,10 @@ class _Watch:
     def process(self, item: Packet | Watermark) -> Iterator[Emission]:
         """Time what the session does with an item, and look from time to time."""
         cpu, wall = 0.0, 0.0
-        readings = self.session.process(item)
+        emissions = self.session.process(item)
         while True:
             before = time.thread_time(), time.perf_counter()
-            emission = next(readings, None)
+            emission = next(emissions, None)
             cpu, wall = cpu + time.thread_time() - before[0], wall + time.perf_counter() - before[1]
             if emission is None:
                 break
@@ -182,7 +182,7 @@ class _Watch:
             self._checks - len(self._wrong),
             lost,
             seconds=seconds,
-            note=f"bit for bit; {self._emissions:,} readings",
+            note=f"bit for bit; {self._emissions:,} emissions",
             failures=tuple(self._wrong),
         )
         return [exact, self._steady(what), self._latency(what)]
