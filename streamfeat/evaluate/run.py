@@ -29,7 +29,6 @@ from streamfeat.evaluate.scores import (
 )
 from streamfeat.evaluate.splits import DataSet
 from streamfeat.files.atomic import unwritable, write_atomically
-from streamfeat.files.locations import size_of
 from streamfeat.files.outputs import locked_file
 from streamfeat.report.machine import describe_machine
 from streamfeat.work.workers import THIS_PROCESS, Workers
@@ -175,13 +174,12 @@ def evaluate(
     header = {
         "format": "streamfeat-evaluate",
         "version": _VERSION,
-        "recordings": [[path.name, size_of(path)] for path in data.paths],
         "folds": data.n_folds,
         "scored": data.scored,
         "groups": data.groups,
         "early_samples": early_samples,
         "models": _models(cells),
-    }
+    } | data.identity
     rows: list[dict[str, Any]] = []
     with closing(StateFile(state, header)) as kept:
         leakage = check_leakage(data, report, workers)

@@ -14,10 +14,10 @@ import numpy as np
 from numba.core.runtime import _nrt_python, rtsys
 
 import streamfeat as sf
-from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.engine.window import count_window
 from tools.bench.inverse import whitened
 from tools.bench.material import Setting, Updates, encoder_of
+from tools.bench.scaling import flat_encoder
 
 __all__ = ["measure_memory", "measure_precision"]
 
@@ -83,7 +83,7 @@ def memory_of_engine(n_filters: int, *, look_ahead: bool) -> dict[str, Any]:
     """
     geometry = sf.Geometry(patch=12, stride=4, n_bins=7, bin_us=1000, downsample=4)
     rng = np.random.default_rng(0)
-    encoder = random_encoder(0, geometry, n_filters, threshold=0.5)
+    encoder = flat_encoder(geometry, n_filters)
     resolution = (480, 640)
     small = sf.Engine(encoder, (96, 96), look_ahead=look_ahead)
     _use(small, rng, 500)
