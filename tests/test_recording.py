@@ -667,7 +667,7 @@ def chunks_of(data):
         at += 9 + length
 
 
-def chunked(path, messages):
+def file_of_chunks(path, messages):
     """A file of one uncompressed chunk for each message."""
     writer = Writer(str(path), chunk_size=1, compression=CompressionType.NONE)
     writer.start("", "")
@@ -680,10 +680,10 @@ def chunked(path, messages):
 
 def test_a_chunk_inside_a_good_chunk_is_not_found_when_what_comes_after_is_damaged(tmp_path):
     """Recordings of recorders hold chunks as data: after a good chunk the search goes on behind it."""
-    inner = chunked(tmp_path / "inner.mcap", [b"in the data"])
+    inner = file_of_chunks(tmp_path / "inner.mcap", [b"in the data"])
     ((start, end),) = chunks_of(inner)
     messages = [bytes(inner[start:end]), b"second", b"third"]
-    data = chunked(tmp_path / "outer.mcap", messages)
+    data = file_of_chunks(tmp_path / "outer.mcap", messages)
     first, second, _ = chunks_of(data)
     damaged = tmp_path / "damaged.mcap"
     data[first[1]] = 0  # no type of a record
