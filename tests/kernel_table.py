@@ -779,7 +779,7 @@ def make_read(rng):
 
 
 def engine_with_news(rng):
-    """An engine with events since its last reading, some planes of which are as if they were being filled."""
+    """An engine with events since its last emission, some planes of which are as if being filled."""
     shape, operator, state = parts_of(read_engine(rng, more=40))
     for plane in range(len(state.cursors)):
         if rng.random() < 0.3:
