@@ -134,7 +134,7 @@ def learn(
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
-        "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
+        "objective": [encoder.provenance["objective"][0], encoder.provenance["objective"][-1]],
         "condition": encoder.provenance["condition"][-1],
         "coherence": encoder.provenance["coherence"][-1],
         "unused": encoder.provenance["unused"],
@@ -142,10 +142,8 @@ def learn(
     }
     entries = encoder.geometry.entries
     if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
-        result["log_determinant"] = (
-            f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
-        )
-    print_result(result, "learned", as_json=as_json)
+        result["log_determinant"] = "A XX' A'"
+    print_result(result, "learned", as_json=as_json, command="learn")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
@@ -244,7 +242,7 @@ def train(
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
-        "labels": ", ".join(trained.labels),
+        "labels": list(trained.labels),
         "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
@@ -254,7 +252,7 @@ def train(
         predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
-    print_result(result, "trained", as_json=as_json)
+    print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
