@@ -117,6 +117,47 @@ MONO = {
 }
 
 
+def _stream_kinds(call):
+    """The first byte of each item of an Event Stream, as far as they are whole."""
+    at, firsts = 0, []
+    while at < len(call.data):
+        first = int(call.data[at])
+        firsts.append(first)
+        at += 1 if first >= (0xFC if call.is_atis else 0xFE) else 5
+    return firsts, at > len(call.data)
+
+
+EVENT_STREAM = {
+    "no byte": lambda call: len(call.data) == 0,
+    "a long time of a DVS": lambda call: not call.is_atis and 0xFF in _stream_kinds(call)[0],
+    "a reset of a DVS": lambda call: not call.is_atis and 0xFE in _stream_kinds(call)[0],
+    "a long time of an ATIS": lambda call: call.is_atis and 0xFE in _stream_kinds(call)[0],
+    "a threshold crossing": lambda call: (
+        call.is_atis and any(f % 2 and f < 0xFC for f in _stream_kinds(call)[0])
+    ),
+    "an event that is cut": lambda call: _stream_kinds(call)[1],
+    "whole events": lambda call: call.result > 0 and not _stream_kinds(call)[1],
+}
+
+ECF = {
+    "no event": lambda call: len(call.out) == 0,
+    "runs of rows, masks of columns": lambda call: call.data[0] & 3 == 0 and call.result > 0,
+    "runs of rows, columns in groups": lambda call: call.data[0] & 3 == 1 and call.result > 0,
+    "pixels in groups": lambda call: call.data[0] & 2 != 0 and call.result > 0,
+    "damaged or cut": lambda call: call.result < 0,
+    "the second time is a long step": lambda call: call.result > 0 and call.data[13] >> 4 == 15,
+    "the first run of times is long": lambda call: call.result > 0 and call.data[12] % 16 == 15,
+}
+
+GROUPS = {
+    "no event": lambda call: len(call.out) == 0,
+    "12 bits": lambda call: call.bits == 12 and call.result > call.at,
+    "24 bits": lambda call: call.bits == 24 and call.result > call.at,
+    "a group that is not whole": lambda call: len(call.out) % 4 != 0 and call.result > call.at,
+    "cut": lambda call: call.result < 0,
+}
+
+
 def _on_sensor(call):
     return (call.events["x"] < call.width) & (call.events["y"] < call.height)
 
@@ -616,6 +657,9 @@ CASES = {
     "decode_evt3": {"no word": lambda call: len(call.words) == 0},
     "decode_libcaer_cmp": LIBCAER_CMP,
     "decode_mono": MONO,
+    "decode_event_stream": EVENT_STREAM,
+    "decode_ecf": ECF,
+    "decode_groups": GROUPS,
     "time_span": TIME_SPAN,
     "mark_noise": NO_EVENT,
     "advance_to_bin": ADVANCE,

@@ -107,7 +107,7 @@ def learn(
     from streamfeat.learn.settings import Setting
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(model, overwrite=overwrite or model == resume)
+    refuse_existing(model, *recordings, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
@@ -213,7 +213,7 @@ def train(
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(classifier, overwrite=overwrite)
+    refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
     variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
     if kernel not in ("linear", "rbf"):
