@@ -138,7 +138,7 @@ def test_training_on_mirror_images_is_said_in_the_classifier(run, home, tmp_path
     both = run(*train, "-o", tmp_path / "both", "--mirror", "--json").json
     assert both["samples"] == plain["samples"]
     plain, both = (Classifier.load(tmp_path / name) for name in ("plain", "both"))
-    assert (plain.provenance["mirror"], both.provenance["mirror"]) == (False, True)
+    assert (plain.provenance["variants"], both.provenance["variants"]) == ([], ["mirrored"])
     assert both.provenance["samples"] == 2 * plain.provenance["samples"]
     assert not np.array_equal(plain.weights, both.weights)
 

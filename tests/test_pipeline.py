@@ -382,7 +382,7 @@ def test_progress_is_told_in_order(digits):
 
 @pytest.mark.real_time
 def test_the_recorded_pace_is_kept():
-    # One packet of 400 ms at twice its pace; it is cut, so that readings do not wait for its end.
+    # One packet of 400 ms at twice its pace; it is cut, so that emissions do not wait for its end.
     sink = ListSink()
     arrived = []
     write = sink.write

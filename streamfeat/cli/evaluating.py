@@ -98,6 +98,8 @@ def evaluate(
     iterations: options.Iterations = None,
     seed: options.Seed = None,
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     on: Annotated[
         str,
@@ -142,7 +144,13 @@ def evaluate(
             refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel, "model": str(model or "")}
+    base = options.setting_given(context) | {
+        "mirror": mirror,
+        "cuts": cuts,
+        "shift": shift,
+        "kernel": kernel,
+        "model": str(model or ""),
+    }
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")

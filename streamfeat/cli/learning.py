@@ -189,6 +189,8 @@ def train(
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
@@ -205,11 +207,13 @@ def train(
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
     from streamfeat.classify.kernel import train_kernel_classifier
+    from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
+    variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
     encoder = Encoder.load(model_or_general(model))
@@ -227,14 +231,13 @@ def train(
         samples = encode_recordings(encoder, opened, report, workers=place)
         if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
-        images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
+        others = [encode_recordings(encoder, opened, report, variant=v, workers=place) for v in variants]
         report("training", 0, 0, f"{folds}-fold cross-validation")
-        rows, labels, numbers = training_set(samples, images)
+        rows, labels, numbers = training_set(samples, others)
         sources = samples.sources[~samples.held_out].tolist()
         parts = assign_folds(labels[: len(sources)], sources, folds, kind)
-        trained = train_classifier(
-            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
-        )
+        made_from = {"variants": [str(v) for v in variants], "groups": kind}
+        trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
     found: Classifier | KernelClassifier = trained
     if kernel == "rbf":
         found = train_kernel_classifier(rows, trained, np.asarray(labels))

@@ -1,4 +1,4 @@
-"""What all commands share.
+"""The common part of all commands.
 
 Lives here: the program itself, arguments and options that several commands have, bars, tables, refusals.
 Not here: the commands.

@@ -1,7 +1,7 @@
 """Commands that look at recordings and make them: info, convert.
 
 Lives here: their arguments, and how their results are shown.
-Not here: reading and writing (`recording`, `recorder`, `foreign`).
+Not here: reading and writing (`recordings`, `convert`).
 """
 
 from typing import TYPE_CHECKING, Annotated, Any

@@ -1,7 +1,7 @@
 """Commands that run the main job: replay.
 
 Lives here: their arguments, and how their results are shown.
-Not here: the job (`replay`).
+Not here: the job (`stream.replay`).
 """
 
 import sys

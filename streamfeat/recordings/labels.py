@@ -67,7 +67,8 @@ def read_labels(path: Path) -> LabelTable:
     """Read a label file.
 
     Raises:
-        InputError: it is missing, or no such table; a time is none, or two labels overlap. Names the line.
+        InputError: the file is missing or not such a table, a time is not a number, or two labels overlap.
+            Names the line.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:

@@ -227,7 +227,7 @@ def checked_speed(speed: float | None) -> float | None:
     """The same speed.
 
     Raises:
-        InputError: it is no number above zero, and not None.
+        InputError: the speed is neither None nor a number above zero.
     """
     if speed is not None and not 0 < speed < 1e9:
         raise InputError(f"a speed of {speed} is not possible; give a number above zero, or None")
