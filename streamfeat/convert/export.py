@@ -48,10 +48,9 @@ class Exported:
     bytes_out: int = 0
 
     def result(self) -> dict[str, Any]:
-        """The counts, as JSON values; but for the first two only those that are not 0."""
-        names = ("labels", "labels_left_out", "subtracted_us")
-        more = {name: value for name in names if (value := getattr(self, name))}
-        return {"events": self.events, "bytes_out": self.bytes_out} | more | self.removed
+        """The counts, as JSON values."""
+        names = ("events", "labels", "labels_left_out", "subtracted_us", "bytes_out", "removed")
+        return {name: getattr(self, name) for name in names}
 
 
 def convert_recording(

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
@@ -27,7 +28,7 @@ METHODS = {
 
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
-_TRAINING = ("mirror", "kernel")
+_TRAINING = ("mirror", "cuts", "shift", "kernel")
 _OTHERS_USE = {
     "model": ("model", *_TRAINING),
     "hats": _TRAINING,
@@ -44,11 +45,15 @@ class Trial(Setting):
     Attributes:
         model: path of the model that the method `model` takes; the general model that ships if empty.
         mirror: train on mirror images of the training samples as well.
+        cuts: milliseconds after which samples are cut to be trained on as well, such as `33+67`.
+        shift: pixels by which samples are moved to each side to be trained on as well.
         kernel: `linear`, or `rbf`.
     """
 
     model: str = ""
     mirror: bool = False
+    cuts: str = ""
+    shift: int = 0
     kernel: str = "linear"
 
     def __post_init__(self) -> None:
@@ -56,6 +61,12 @@ class Trial(Setting):
         if self.kernel not in ("linear", "rbf"):
             raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
         Setting.__post_init__(self)
+        self.variants  # noqa: B018  (refuses what makes no sense)
+
+    @property
+    def variants(self) -> tuple[Variant, ...]:
+        """What the classifier is trained on beside the samples themselves."""
+        return variants_of(mirror=self.mirror, cuts=parse_cuts(self.cuts), shift=self.shift)
 
 
 _DEFAULTS = {field.name: field.default for field in fields(Trial)}
@@ -95,7 +106,9 @@ class Cell:
 
     def has_features_of(self, other: "Cell") -> bool:
         """Whether the same features serve both, so that they need not be made twice."""
-        mine, others = (replace(cell.setting, mirror=False, kernel="linear") for cell in (self, other))
+        mine, others = (
+            replace(cell.setting, mirror=False, cuts="", shift=0, kernel="linear") for cell in (self, other)
+        )
         return (self.method, self.fold, mine) == (other.method, other.fold, others)
 
 

@@ -200,8 +200,12 @@ def notes(result: dict[str, Any]) -> list[str]:
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "
             "Filters are learned without labels, from samples that are not held out."
         )
-    if any(row["setting"].get("mirror") for row in base_rows(result)):
-        lines.append("Mirror images of the training samples were trained on as well, for every method.")
+    setting = base_rows(result)[0]["setting"]
+    more = ["mirror images"] if setting["mirror"] else []
+    more += [f"beginnings of {setting['cuts']} ms"] if setting["cuts"] else []
+    more += [f"copies moved by {setting['shift']} pixels"] if setting["shift"] else []
+    if more:
+        lines.append(f"Trained, for every method, on {', '.join(more)} of the training samples as well.")
     others = [row["method"] for row in base_rows(result) if row["method"] not in ("direct", "inverse")]
     if others:
         lines.append("; ".join(f"{method}: {METHODS[method]}" for method in others) + ".")

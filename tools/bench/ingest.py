@@ -1,6 +1,6 @@
 """Ingest alone: counting events into the ring, against voxel grids of the same events.
 
-Lives here: the part `ingest`. Not here: reading features.
+Lives here: the part `ingest`. Not here: emissions.
 
 Each library gets the events as it likes them best, prepared outside the timed run: tonic a structured array
 of int64 (it changes polarities in place, so each run has its copy), eventcv its own stream.
