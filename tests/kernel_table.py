@@ -500,6 +500,22 @@ def make_ecf(rng):
     return np.concatenate([data, np.zeros(ECF_PADDING, np.uint8)]), len(data), np.zeros(n, EVENT_DTYPE)
 
 
+def make_rows(rng):
+    separator = pick(rng, [b",", b";", b" "])
+    numbers = [b"1", b"-20", b"+3", b"0.5", b".25", b"7.", b"123456789012345678", b" 4\t"]
+    bad = [b"", b".", b"-", b"1e5", b"x", b"1234567890123456789", b"0.123456789012345678", b"1 2", b"--1"]
+    rows = []
+    for _ in range(int(rng.integers(0, 6))):
+        kinds = numbers + bad * (rng.random() < 0.15)
+        rows.append(separator.join(pick(rng, kinds) for _ in range(int(rng.integers(3, 6)))))
+        rows += [b"  "] * (rng.random() < 0.2)
+    text = b"\n".join(rows) + b"\n" * (rng.random() < 0.9)
+    wanted = np.array(pick(rng, [[0, 1, 2], [0, 2], [1], [2, 3]]))
+    out = np.zeros((2, len(wanted), int(pick(rng, [3, 9, 9]))), np.int64)
+    code = separator[0] if separator != b" " else 0
+    return np.frombuffer(text, np.uint8).copy(), code, wanted, out[0].copy(), out[1].copy()
+
+
 def make_groups(rng):
     data = rng.integers(0, 256, 140, np.uint8)
     bits = int(pick(rng, [12, 24]))
@@ -1061,6 +1077,7 @@ KERNELS = [
     Row(file_codes.decode_event_stream, make_event_stream),
     Row(file_codes.decode_ecf, make_ecf, exact_unless_refused),
     Row(file_codes.decode_groups, make_groups, exact_unless_refused),
+    Row(file_codes.parse_rows, make_rows, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),
     Row(ingest.start_of_bin, make_start_of_bin),

@@ -1,7 +1,7 @@
 """Commands that run the main job: replay.
 
 Lives here: their arguments, and how their results are shown.
-Not here: the job (`replay`).
+Not here: the job (`stream.replay`).
 """
 
 import sys
@@ -48,7 +48,7 @@ def replay(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: EmitOption = "auto",
+    emit: EmitOption = "bin",
     speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
@@ -105,7 +105,7 @@ def replay(
             report,
         )
     if not to_terminal:
-        print_result(job.result(), "replayed", as_json=as_json)
+        print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
     if job.interrupted:
         raise typer.Exit(130)

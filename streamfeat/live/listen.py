@@ -200,7 +200,10 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+                n_filters = self._encoder.n_filters
+                return lines.open(
+                    self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
+                )
 
             with self.opened(sinks) as pipeline:
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
