@@ -610,6 +610,61 @@ TIME_SURFACES = {
     "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
 }
 
+# Files: the first bytes say what follows, and damage ends a chunk.
+
+
+def _is_event(call, byte):
+    """Whether an Event Stream begins with this kind of byte, and the event is whole."""
+    return len(call.data) > 4 and byte(int(call.data[0]))
+
+
+EVENT_STREAM = {
+    "no byte": lambda call: len(call.data) == 0,
+    "a reset": lambda call: not call.is_atis and 254 in call.data,
+    "a longer time": lambda call: not call.is_atis and 255 in call.data,
+    "a longer time of an ATIS": lambda call: call.is_atis and bool((call.data > 0xFC).any()),
+    "an event": lambda call: not call.is_atis and _is_event(call, lambda first: first < 254),
+    "an event of an ATIS": lambda call: call.is_atis and _is_event(call, lambda b: b < 0xFC and b % 2 == 0),
+    "a crossing": lambda call: call.is_atis and _is_event(call, lambda b: b < 0xFC and b % 2),
+    "an event cut in two": lambda call: 0 < len(call.data) < 5 and call.data[0] < 0xFC,
+}
+
+ECF = {
+    "no event": lambda call: len(call.out) == 0,
+    "whole pixels": lambda call: call.result > 0 and call.data[0] & 2 and len(call.out) > 0,
+    "packed columns": lambda call: call.result > 0 and call.data[0] & 3 == 1 and len(call.out) > 0,
+    "masks of columns": lambda call: call.result > 0 and call.data[0] & 3 == 0 and len(call.out) > 0,
+    "a long step of time": lambda call: call.result > 0 and len(call.out) > 1 and call.data[13] >> 4 == 15,
+    "a long run of times": lambda call: call.result > 0 and bool((call.data[12:18] & 15 == 15).any()),
+    "it ends too early": lambda call: call.result == -1 - call.size,
+    "damage within it": lambda call: -1 - call.size < call.result < 0,
+}
+
+GROUPS = {
+    "no event": lambda call: len(call.out) == 0 and call.result == call.at,
+    "12 bits": lambda call: call.bits == 12 and call.result > call.at,
+    "24 bits": lambda call: call.bits == 24 and call.result > call.at,
+    "fewer than four at the end": lambda call: call.result > call.at and len(call.out) % 4 > 0,
+    "it ends too early": lambda call: call.result < 0,
+}
+
+ROWS = {
+    "no row": lambda call: call.result == 0,
+    "rows": lambda call: call.result > 1,
+    "blanks separate": lambda call: call.separator == 0 and call.result > 0,
+    "points": lambda call: call.result > 0 and b"." in bytes(call.text),
+    "signs": lambda call: call.result > 0 and b"-" in bytes(call.text),
+    "an empty line": lambda call: call.result > 0 and b"\n  \n" in bytes(call.text),
+    "no end of the last line": lambda call: call.result > 0 and not bytes(call.text).endswith(b"\n"),
+    "no number": lambda call: call.result < 0 and b"x" in bytes(call.text),
+    "an exponent": lambda call: call.result < 0 and b"e" in bytes(call.text),
+    "19 digits": lambda call: call.result < 0 and b"1234567890123456789" in bytes(call.text),
+    "more than a float holds": lambda call: call.result < 0 and b"0.123456789012345678" in bytes(call.text),
+    "more rows than room": lambda call: (
+        call.result < 0 and bytes(call.text).count(b"\n") >= call.digits.shape[1]
+    ),
+}
+
 NO_EVENT = {"no event": lambda call: len(call.events) == 0}
 
 CASES = {
@@ -618,6 +673,10 @@ CASES = {
     "decode_mono": MONO,
     "time_span": TIME_SPAN,
     "mark_noise": NO_EVENT,
+    "decode_event_stream": EVENT_STREAM,
+    "decode_ecf": ECF,
+    "decode_groups": GROUPS,
+    "parse_rows": ROWS,
     "advance_to_bin": ADVANCE,
     "count_event": COUNT_EVENT,
     "start_of_bin": START_OF_BIN,

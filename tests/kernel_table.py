@@ -486,7 +486,8 @@ def make_event_stream(rng):
 def make_ecf(rng):
     n = int(rng.integers(0, 60))
     events = np.zeros(n, EVENT_DTYPE)
-    events["t"] = np.cumsum(rng.choice([0, 0, 1, 14, 15, 16, 300_000], n)) + int(rng.integers(0, 2**40))
+    steps = pick(rng, [[0, 0, 1, 14, 15, 16, 300_000], [0]])
+    events["t"] = np.cumsum(rng.choice(steps, n)) + int(rng.integers(0, 2**40))
     events["y"] = np.repeat(rng.integers(0, 2048, n), int(pick(rng, [1, 3, 40])))[:n]
     events["x"] = np.minimum(np.cumsum(rng.choice([1, 1, 2, 7], n)), 2047)
     events["p"] = np.repeat(rng.integers(0, 2, n), int(pick(rng, [1, 2, 130])))[:n]
