@@ -85,7 +85,7 @@ def assert_agree(case, engine, features, counts, how):
     mine = engine.features()
     operator, unit = engine._operator, engine._operator.unit
     assert_certified(operator, engine._state)
-    assert_pooled(engine.grid_shape, operator, engine._state)
+    assert_pooled(operator, engine._state)
     codes = np.trunc(engine.snapshot().atoms.astype(np.float64) * unit) / unit
     np.testing.assert_array_equal(engine.codes().reshape(codes.shape), codes.astype(np.float32))
     expected = naive.features_from(

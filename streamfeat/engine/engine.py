@@ -8,7 +8,8 @@ pooled sums up to date with whatever has changed since. What is read depends on 
 time, never on how often it was read or how the stream was cut into batches.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,20 +35,20 @@ from streamfeat.kernels.layout import (
     CLOCK_TOUCHED,
     CURSOR_CODED,
     MOMENT_SQUARES,
-    PARTS,
     TALLY_EVENTS,
+    Operator,
+    State,
 )
-from streamfeat.kernels.planes import complete, look_ahead
-from streamfeat.kernels.update import finish, mark_dirty, read, renew, settle, update
+from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
+from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
 
-__all__ = ["Engine", "EngineStats", "Snapshot", "Spread"]
+__all__ = ["MOST_THREADS", "Engine", "EngineStats", "Snapshot"]
 
-Spread = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
-"""Calls a function for each of some numbers: `map`, one after the other, or the `map` of an executor."""
+MOST_THREADS = 256
 
-_WORTH_SPREADING = 1 << 20
+_WORTH_SHARING = 1 << 20
 """Filters times volumes or entries that changed: a millisecond of work at least, against a tenth of one for
-handing half of it to another thread."""
+handing a part of it to another thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,7 @@ class Snapshot:
         bin: the current one; `BEFORE_TIME` in an engine that has seen nothing.
         origin_us: stream time at which bin 0 starts.
         tally: `(5,)` int64, what was counted.
-        encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
+        encoded: `(2,)` int64, their sum is how many volumes were encoded.
     """
 
     fingerprint: str
@@ -105,11 +106,11 @@ class Engine:
         origin_us: stream time at which bin 0 starts.
         look_ahead: prepare each bin boundary beforehand, in slices: with every event that is followed, and
             in `prepare`. Costs a second copy of the projections; for those who read after single events.
-        spread: how the two halves of a large reading are made: `map`, or an executor's, for two cores.
+        threads: that share the work of a large emission; features have the same bits for any number.
 
     Raises:
-        InputError: the sensor has no place for a single volume, or so many that sums could overflow; or the
-            origin is beyond 2^62 microseconds.
+        InputError: the sensor has no place for a single volume, or so many that sums could overflow; the
+            origin is beyond 2^62 microseconds; or threads are not 1 to 256.
     """
 
     def __init__(
@@ -119,13 +120,16 @@ class Engine:
         *,
         origin_us: int = 0,
         look_ahead: bool = False,
-        spread: Spread = map,
+        threads: int = 1,
     ) -> None:
         """Allocate everything; nothing is allocated later but the copies that are handed out."""
         self.encoder = encoder
         self.resolution = resolution
         self.grid_shape = encoder.geometry.grid_shape(resolution)
-        self._spread = spread
+        if not 1 <= threads <= MOST_THREADS:
+            raise InputError(f"{threads} threads: an engine uses 1 to {MOST_THREADS}")
+        # A thread starts with the first large emission, and ends with the engine.
+        self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
         self._operator = with_fixed_point(encoder.operator, self.grid_shape)
         self._state = allocate_state(
             encoder.geometry,
@@ -133,6 +137,7 @@ class Engine:
             resolution,
             origin_us=self._checked_time(origin_us),
             planes=2 if look_ahead else 1,
+            threads=threads,
         )
 
     def feed(self, batch: Events) -> None:
@@ -162,7 +167,7 @@ class Engine:
         """
         events = self._checked(batch)
         self._update()
-        follow(events, self.grid_shape, self._operator, self._state)
+        follow(events, self._operator, self._state)
 
     def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Feed a batch event by event, and read the features after each.
@@ -181,7 +186,7 @@ class Engine:
         self._update()
         features = np.empty((len(events), n_features(self._operator)), np.float32)
         accepted = np.empty(len(events), np.int64)
-        trace(events, self.grid_shape, self._operator, self._state, features, accepted)
+        trace(events, self._operator, self._state, features, accepted)
         return features, accepted
 
     def prepare(self, columns: int) -> bool:
@@ -195,24 +200,23 @@ class Engine:
         """
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
-        left = look_ahead(volumes, volumes, columns, self.grid_shape, self._operator, self._state)
+        left = look_ahead(volumes, volumes, columns, self._operator, self._state)
         return bool(left > 0)
 
     def _update(self) -> None:
         """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
-        shape, operator, state = self.grid_shape, self._operator, self._state
+        operator, state = self._operator, self._state
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
-        volumes = 0 if self._is_complete else shape[0] * shape[1]
-        large = max(volumes, int(state.clock[CLOCK_TOUCHED])) * operator.offset.shape[0] >= _WORTH_SPREADING
-        if self._spread is map or not large:
-            update(shape, operator, state)
+        if self._others is None or not self._is_large:
+            update(operator, state)
             return
-        mark_dirty(shape, operator, state)
-        self._halves(lambda part: renew(part, shape, operator, state))
-        settle(operator, state)
-        self._halves(lambda part: complete(part, shape, operator, state))
-        finish(shape, state)
+        mark_dirty(operator, state)
+        self._share(renew)
+        settle(state)
+        list_missing(operator, state)
+        self._share(complete)
+        finish(operator, state)
 
     @property
     def _is_complete(self) -> bool:
@@ -220,9 +224,20 @@ class Engine:
         coded = state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED]
         return bool(coded == self.grid_shape[0] * self.grid_shape[1])
 
-    def _halves(self, work: Callable[[int], None]) -> None:
-        for _ in self._spread(work, range(PARTS)):
-            pass
+    @property
+    def _is_large(self) -> bool:
+        volumes = 0 if self._is_complete else self.grid_shape[0] * self.grid_shape[1]
+        touched = int(self._state.clock[CLOCK_TOUCHED])
+        return max(volumes, touched) * self._operator.offset.shape[0] >= _WORTH_SHARING
+
+    def _share(self, work: Callable[[int, Operator, State], None]) -> None:
+        """Do the first part of some work here, and the other parts on other threads."""
+        operator, state, others = self._operator, self._state, self._others
+        assert others is not None
+        parts = [others.submit(work, part, operator, state) for part in range(1, len(state.code))]
+        work(0, operator, state)
+        for part in parts:
+            part.result()
 
     @staticmethod
     def _checked(batch: Events) -> Events:
@@ -253,10 +268,10 @@ class Engine:
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._spread is not map:
+        if self._others is not None:
             self._update()
         features = np.empty(n_features(self._operator), np.float32)
-        read(self.grid_shape, self._operator, self._state, features)
+        read(self._operator, self._state, features)
         return features
 
     def codes(self) -> NDArray[np.float32]:
@@ -342,7 +357,7 @@ class Engine:
             bin=int(state.clock[CLOCK_NOW]),
             origin_us=int(state.clock[CLOCK_ORIGIN]),
             tally=state.tally.copy(),
-            encoded=state.encoded.copy(),
+            encoded=np.array([state.encoded.sum(), 0]),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -366,10 +381,11 @@ class Engine:
             state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
             state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        update(self.grid_shape, self._operator, state)
+        update(self._operator, state)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
-        state.encoded[:] = snapshot.encoded
+        state.encoded[:] = 0
+        state.encoded[0] = snapshot.encoded.sum()
 
     def _check(self, snapshot: Snapshot) -> None:
         state, operator = self._state, self._operator
@@ -378,7 +394,8 @@ class Engine:
                 f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
                 f"{self.encoder.fingerprint[:12]}"
             )
-        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, state.encoded)
+        encoded = np.zeros(2, np.int64)
+        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, encoded)
         for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
             given = getattr(snapshot, name)
             if given.dtype != array.dtype or given.shape != array.shape:

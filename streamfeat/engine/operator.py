@@ -190,7 +190,7 @@ def _largest_code(operator: Operator) -> float:
 
 
 def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operator:
-    """The operator with codes in units of the finest fixed point that a grid of volumes allows.
+    """The operator of one sensor: its grid, and codes in units of the finest fixed point that it allows.
 
     Args:
         operator: in units of one.
@@ -204,7 +204,7 @@ def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operato
     unit = 2.0 ** _fixed_point_bits(operator, volumes)
     offset = operator.offset * np.float32(unit)
     offset.flags.writeable = False
-    return operator._replace(unit=unit, offset=offset, threshold=operator.threshold * unit)
+    return operator._replace(unit=unit, offset=offset, threshold=operator.threshold * unit, shape=grid_shape)
 
 
 def n_features(operator: Operator) -> int:
