@@ -62,7 +62,8 @@ def is_valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
     height, width = resolution
     p, t = events["p"], events["t"]
     inside = (events["x"] < width) & (events["y"] < height)
-    return inside & ((p == 0) | (p == 1)) & (t > -TIME_LIMIT) & (t < TIME_LIMIT)
+    valid: NDArray[np.bool_] = inside & ((p == 0) | (p == 1)) & (t > -TIME_LIMIT) & (t < TIME_LIMIT)
+    return valid
 
 
 def make_events(x: ArrayLike, y: ArrayLike, p: ArrayLike, t: ArrayLike) -> Events:

@@ -18,21 +18,40 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import pytest
 from hypothesis import settings
 
-# The same examples at every run where nobody is there to look at a new one; no limit on compiling a kernel.
-settings.register_profile("default", deadline=None)
-settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
+# New examples at every run, in CI too: a failure prints the blob that brings its example back. No limit on
+# compiling a kernel. CI looks at half as many where a test does not say how many, for time.
+settings.register_profile("default", deadline=None, print_blob=True)
+settings.register_profile("ci", settings.get_profile("default"), derandomize=False, max_examples=50)
 settings.load_profile("ci" if os.environ.get("CI") else "default")
 
 
-# Real sessions, processes and clocks, on machines that others share: a failure counts if it comes again.
-# All other tests have one try. What was tried again is in the last line of the run.
-WITH_CLOCKS = ("test_live_", "test_view_", "test_cluster", "test_pipeline", "test_what_happens", "test_state")
-
-
 def pytest_collection_modifyitems(items):
+    """Try tests of real networks, processes and clocks again: others use the same machine."""
     for item in items:
-        if item.path.name.startswith(WITH_CLOCKS):
+        if item.get_closest_marker("real_time"):
             item.add_marker(pytest.mark.flaky(reruns=2))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item):
+    """Fail in CI where a test is skipped for want of an input that `.ci/run` says is there."""
+    outcome = yield
+    report = outcome.get_result()
+    expected = os.environ.get("STREAMFEAT_CI_INPUTS", "").split(",")
+    if report.skipped and isinstance(report.longrepr, tuple):
+        reason = report.longrepr[2]
+        if any(name and name in reason for name in expected):
+            report.outcome, report.longrepr = "failed", f"must not be skipped here: {reason}"
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say which tests needed another try, and how often."""
+    again = [report.nodeid for report in terminalreporter.stats.get("rerun", ())]
+    if again:
+        terminalreporter.section("tried again")
+        for nodeid in dict.fromkeys(again):
+            terminalreporter.line(f"{again.count(nodeid)}x {nodeid}")
+    terminalreporter.line(f"tried again: {len(again)} times, {len(set(again))} tests of real time")
 
 
 @pytest.fixture(scope="session")

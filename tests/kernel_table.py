@@ -19,6 +19,7 @@ from streamfeat.kernels import (
     change,
     code,
     decode,
+    denoise,
     encode,
     follow,
     ingest,
@@ -29,6 +30,7 @@ from streamfeat.kernels import (
     volume,
 )
 from streamfeat.kernels.layout import (
+    BEFORE_TIME,
     CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
@@ -487,6 +489,18 @@ def make_evt3(rng):
 def make_libcaer_cmp(rng):
     words = random_words(rng, [0, 1, 2, 3, 3, 4, 5] + [6] * (rng.random() < 0.1))
     return words, int(rng.integers(0, 2**50)), np.zeros(3, np.int64), np.zeros(8 * len(words), EVENT_DTYPE)
+
+
+def make_mono(rng):
+    words = rng.integers(0, 2**64, int(rng.integers(0, 80)), np.uint64)
+    return words, int(rng.integers(0, 2**54)), int(rng.integers(0, 1000)), np.zeros(len(words), EVENT_DTYPE)
+
+
+def make_time_span(rng):
+    events = np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
+    events["x"], events["y"] = rng.integers(0, 12, len(events)), rng.integers(0, 12, len(events))
+    events["t"] = rng.integers(-(2**62), 2**62, len(events))
+    return events, int(rng.integers(1, 12)), int(rng.integers(1, 12)), np.array([7, 7])
 
 
 def random_words(rng, kinds):
@@ -966,6 +980,21 @@ def close_surfaces(kernel: Run, twin: Run) -> None:
         np.testing.assert_allclose(mine, yours, rtol=1e-6)
 
 
+def make_mark_noise(rng):
+    height, width, n = int(rng.integers(1, 6)), int(rng.integers(1, 6)), int(rng.integers(0, 200))
+    events = np.zeros(n, EVENT_DTYPE)
+    events["x"], events["y"] = rng.integers(0, width + 1, n), rng.integers(0, height + 1, n)
+    events["p"] = rng.choice([0, 1, 0, 1, 0, 1, -1, 2], n)
+    steps = rng.choice([0, 1, 20, 300, -40, 5_000, 2_000_000, -2_000_000], n, p=[0.2] * 4 + [0.05] * 4)
+    events["t"] = np.cumsum(steps)
+    if n:
+        events["t"][rng.integers(0, n)] = rng.choice([1 << 62, -(1 << 62), (1 << 62) - 1, 1 - (1 << 62), 5])
+    limits = np.array([rng.choice([0, 1, 90_000, 600_000]), *rng.choice([0, 1, 30, 1_000], 2)], np.int64)
+    past = np.where(rng.random((3, height, width)) < 0.5, BEFORE_TIME, rng.integers(-500, 500))
+    level = rng.integers(0, 2 * denoise.HOT_LEVEL, (height, width))
+    return events, limits, past.astype(np.int64), level, rng.integers(0, 9, 3), np.zeros(n, np.bool_)
+
+
 @dataclass(frozen=True)
 class Row:
     """A kernel, a maker of random arguments, and the meaning of "the same result"."""
@@ -997,6 +1026,9 @@ KERNELS = [
     Row(code.gain, make_gain),
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
+    Row(decode.decode_mono, make_mono),
+    Row(decode.time_span, make_time_span),
+    Row(denoise.mark_noise, make_mark_noise),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.is_valid, make_is_valid),
     Row(ingest.count_event, make_count_event),

@@ -10,8 +10,9 @@ from contextlib import contextmanager
 
 import zenoh
 
-from streamfeat.live.listen import ListenJob
-from streamfeat.live.names import PlainNames
+from streamfeat.engine.encoder import Encoder
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.warming import warm_up
 
 PATIENCE_S = float(os.environ.get("LIVE_PATIENCE_S", "120"))
 """Kernels may have to be compiled first, on a machine that has other things to do."""
@@ -85,7 +86,7 @@ def attachment(seq, gid=b"0123456789abcdef", source_ns=0):
 def compiled(folder):
     """Compile what listening needs, before anybody waits for anything; processes find it in numba's cache."""
     for emit in ("event", "10ms"):
-        ListenJob(PlainNames("x"), folder / "model", emit=emit)._warm_up()
+        warm_up(Encoder.load(folder / "model"), EmitPolicy.parse(emit), decoders=True)
     return folder
 
 
@@ -122,13 +123,13 @@ class ListSink:
 
 
 @contextmanager
-def running(job, **options):
+def running(job, *arguments):
     """Run a job in a thread while the block runs; stop it then, and raise what it raised."""
     errors = []
 
     def run():
         try:
-            job.run(**options)
+            job.run(*arguments)
         except BaseException as error:
             errors.append(error)
 

@@ -43,7 +43,7 @@ def decode_evt3(words, state, out):
             ahead = time_high - time_high % 4096 + value
             if ahead < time_high:
                 ahead += 4096
-            is_late_word = ahead - 4096 >= 0 and time_high - (ahead - 4096) <= 10 and ahead != time_high
+            is_late_word = ahead - 4096 >= 0 and time_high - (ahead - 4096) < 2048 and ahead != time_high
             time_high = ahead - 4096 if is_late_word else ahead
             seen = max(seen, 1)
         elif seen >= 1 and kind == 0x6:
@@ -87,6 +87,19 @@ def decode_libcaer_cmp(words, base_us, state, out):
             base = (base + 8) % 65536
     state[:] = x, base, polarity
     return _write(events, out)
+
+
+def decode_mono(words, base_us, rest_ns, out):
+    for i, word in enumerate(words.tolist()):
+        ns = rest_ns + word % 2**32
+        out[i] = word // 2**32 % 2**16, word // 2**48 % 2**15, word // 2**63, base_us + ns // 1000
+
+
+def time_span(events, height, width, span):
+    t = events["t"][(events["x"] < width) & (events["y"] < height)]
+    if len(t):
+        span[:] = t.min(), t.max()
+    return len(t)
 
 
 def _write(events, out):
@@ -739,6 +752,39 @@ def features_from(codes, encoding, pooling=2):
     for place in np.ndindex(codes.shape[:2]):
         cells[cell(place, codes.shape[:2], pooling)] += codes[place]
     return cells.ravel()
+
+
+# streamfeat.kernels.denoise
+
+
+def mark_noise(events, limits, past, level, removed, keep):
+    rise, refractory, support = limits.tolist()
+    for i, (x, y, p, t) in enumerate(events.tolist()):
+        keep[i] = True
+        if not (x < level.shape[1] and y < level.shape[0] and p in (0, 1) and abs(t) < 1 << 62):
+            continue
+        hot_before, kept_before, _ = past[:, y, x].tolist()
+        if rise:
+            past[0, y, x] = t
+            left = max(int(level[y, x]) - max(t - hot_before, 0), 0)
+            level[y, x] = min(left + rise, 2_000_000)
+        if rise and level[y, x] > 1_000_000:
+            reason = 0
+        elif refractory and abs(t - kept_before) < refractory:
+            reason = 1
+        else:
+            reason = None
+            if refractory:
+                past[1, y, x] = t
+            if support:
+                around = past[2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].ravel().tolist()
+                around.remove(past[2, y, x])
+                past[2, y, x] = t
+                if not any(abs(t - other) <= support for other in around):
+                    reason = 2
+        if reason is not None:
+            keep[i] = False
+            removed[reason] += 1
 
 
 # streamfeat.kernels.surfaces

@@ -82,6 +82,7 @@ def test_sums_are_added_as_one_tree(values, threads):
     assert found[0] == pytest.approx(sum(values), abs=1e-6)
 
 
+@pytest.mark.real_time
 @settings(max_examples=5)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40))
 def test_sums_of_a_cluster_are_the_same_tree(two, values):
@@ -97,6 +98,7 @@ def alone(value):
 # --- the same wherever it is done
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("formulation", ["direct", "inverse"])
 def test_what_is_learned_has_the_same_bits(two, formulation):
     expected = learned_here(formulation)
@@ -122,10 +124,12 @@ def evaluated(animals, workers, finished=lambda row: None):
     return rows_of(evaluate(data, cells, early_samples=4, workers=workers, finished=finished))
 
 
+@pytest.mark.real_time
 def test_an_evaluation_is_the_same(two, animals):
     assert evaluated(animals, two) == evaluated(animals, ThreadWorkers(1))
 
 
+@pytest.mark.real_time
 def test_a_conversion_is_the_same(two, tmp_path):
     for name in ("cat", "dog"):
         (tmp_path / "data" / name).mkdir(parents=True)
@@ -143,6 +147,7 @@ def test_a_conversion_is_the_same(two, tmp_path):
 # --- whoever dies
 
 
+@pytest.mark.real_time
 def test_a_worker_that_dies_while_learning_changes_nothing(two):
     before = [*two.processes().values()]
 
@@ -154,6 +159,7 @@ def test_a_worker_that_dies_while_learning_changes_nothing(two):
     assert len(before) == 1
 
 
+@pytest.mark.real_time
 def test_a_worker_that_dies_while_evaluating_changes_nothing(two, animals):
     expected = evaluated(animals, ThreadWorkers(1))
     before = [*two.processes().values()]
@@ -172,6 +178,7 @@ def hears_nothing_at_first(service, mark):
     return {"first": first}
 
 
+@pytest.mark.real_time
 def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(two, tmp_path):
     told, reasons = [], {}
     services = Services(two, lambda name, worker, what: told.append((name, what["first"])))
@@ -187,6 +194,7 @@ def test_an_errand_that_ended_because_the_scheduler_did_not_answer_begins_again(
 # --- what cannot be
 
 
+@pytest.mark.real_time
 def test_a_scheduler_that_does_not_answer_is_one_line(run, tmp_path, monkeypatch):
     monkeypatch.setattr("streamfeat.work.cluster._PATIENCE_S", 0.5)
     address = f"tcp://127.0.0.1:{free_port()}"
@@ -233,6 +241,7 @@ def scheduler_and_worker(*folders):
         yield address
 
 
+@pytest.mark.real_time
 def test_workers_of_another_version_are_refused(tmp_path):
     other = tmp_path / "streamfeat-9.9.dist-info"
     other.mkdir()
@@ -245,6 +254,7 @@ def test_workers_of_another_version_are_refused(tmp_path):
         pass
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("lacking", "reason"),
     [("scheduler", "a worker or the scheduler lacks a package: "), ("worker", "no worker is left")],
@@ -268,6 +278,7 @@ def refuse(piece):
     return piece
 
 
+@pytest.mark.real_time
 def test_a_piece_that_cannot_be_read_is_one_line_with_the_worker(two):
     found = two.map(refuse, ((i,) for i in range(9)))
     assert [next(found) for _ in range(3)] == [0, 1, 2]
@@ -275,6 +286,7 @@ def test_a_piece_that_cannot_be_read_is_one_line_with_the_worker(two):
         next(found)
 
 
+@pytest.mark.real_time
 def test_ctrl_c_keeps_what_was_learned_and_ends_quietly(tmp_path):
     small = [str(word) for name, value in SMALL.items() for word in (f"--{name}", value)]
     words = ["learn", str(TRAIN), "-o", str(tmp_path / "model"), "--workers", "2", "--verbose", *small]
@@ -296,6 +308,7 @@ def deadly(piece):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.real_time
 def test_work_that_kills_every_worker_is_given_up():
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),

@@ -1,10 +1,9 @@
-"""Damage: a few of what `python tools/torture --only damage` does by the thousand."""
+"""Damage: a few of what `python tests/torture --only damage` does by the thousand."""
 
 import random
 
 import pytest
-
-from tools.torture.damage import flipped, make_specimen, try_damage
+from torture.damage import flipped, make_specimen, try_damage
 
 
 @pytest.fixture(scope="module", params=["libcaer_cmp", "evt3"])

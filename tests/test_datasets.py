@@ -9,7 +9,9 @@ import pytest
 from test_event_files import bin40_bytes, dat_bytes, text_bytes
 
 from streamfeat.camera_files.event_files import read_events
-from streamfeat.convert.datasets import SamplePath, convert, find_samples
+from streamfeat.convert.datasets import convert, find_samples
+from streamfeat.convert.splits import SamplePath, hold_out_block, parse_hold_out
+from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
 from streamfeat.recordings.reader import Label, Sample, open_recording
@@ -141,14 +143,42 @@ class TestConvert:
         assert sample.resolution == (480, 640)
 
     def test_every_fifth_is_validation(self, ncars, tmp_path):
-        convert(ncars / "n-cars_train", tmp_path / "o.mcap", split_every=5)
+        convert(ncars / "n-cars_train", tmp_path / "o.mcap", interleaved=5)
         splits = [sample.label.split for sample in samples_of(tmp_path / "o.mcap")]
         assert splits == (["train"] * 4 + ["validation"]) * 2
 
     def test_test_samples_are_neither_renamed_nor_counted(self, ncars, tmp_path):
-        convert(ncars, tmp_path / "o.mcap", split_every=5)
+        convert(ncars, tmp_path / "o.mcap", interleaved=5)
         splits = [sample.label.split for sample in samples_of(tmp_path / "o.mcap")]
         assert splits == ["test"] * 2 + (["train"] * 4 + ["validation"]) * 2
+
+    def test_a_block_of_neighbours_of_each_class_is_held_out(self, ncars, tmp_path):
+        convert(ncars, tmp_path / "o.mcap", hold_out=(2, 5))
+        found = [(s.label.source[-13:-7], s.label.split) for s in samples_of(tmp_path / "o.mcap")]
+        assert [n for n, split in found if split == "validation"] == ["000004", "000003"]
+        assert [n for n, split in found if split == "test"] == ["000000", "000011"]
+
+    def test_blocks_follow_numbers_and_not_letters(self):
+        samples = [SamplePath(Path(f"a/{n}.dat"), "a", "", f"a/{n}.dat") for n in (10, 9, 100, 8)]
+        marked = hold_out_block(samples, 1, 2)
+        assert {s.path.stem for s in marked if s.split == "validation"} == {"8", "9"}
+
+    def test_every_sample_is_held_out_in_one_block(self, ncars):
+        samples = find_samples(ncars / "n-cars_train")
+        held_out = [
+            s.source for i in range(3) for s in hold_out_block(samples, i + 1, 3) if s.split == "validation"
+        ]
+        assert sorted(held_out) == [s.source for s in samples]
+
+    def test_noise_is_taken_out_of_each_sample_by_itself(self, ncars, tmp_path):
+        done = convert(ncars, tmp_path / "o.mcap", denoising=Denoising(refractory_us=100_000))
+        denoiser = Denoiser(Denoising(refractory_us=100_000))
+        for sample, path in zip(samples_of(tmp_path / "o.mcap"), find_samples(ncars), strict=True):
+            denoiser.restart()
+            expected = denoiser.events(read_events(path.path).events, sample.resolution)
+            assert (sample.events["t"] - sample.label.start_us).tolist() == expected["t"].tolist()
+        assert done.removed == denoiser.removed
+        assert done.events == 600 - done.removed["refractory"] < 600
 
     def test_split_can_be_named(self, ncars, tmp_path):
         convert(ncars, tmp_path / "o.mcap", split="holdout")
@@ -156,8 +186,8 @@ class TestConvert:
 
     def test_limit_keeps_all_labels_and_the_split_of_each_sample(self, ncars, tmp_path):
         inner = ncars / "n-cars_train"
-        convert(inner, tmp_path / "all.mcap", split_every=2)
-        convert(inner, tmp_path / "few.mcap", split_every=2, limit=4)
+        convert(inner, tmp_path / "all.mcap", interleaved=2)
+        convert(inner, tmp_path / "few.mcap", interleaved=2, limit=4)
         splits = {s.label.source: s.label.split for s in samples_of(tmp_path / "all.mcap")}
         few = samples_of(tmp_path / "few.mcap")
         assert [s.label.label for s in few].count("cars") == 2 == len(few) / 2
@@ -187,17 +217,6 @@ class TestConvert:
         put(tmp_path / "in/Train/1/b.bin", bin40_bytes(sample_events(1, width=40)))
         done = convert(tmp_path / "in", tmp_path / "o.mcap")
         assert [(path.name, "40x25" in reason) for path, reason in done.failed] == [("b.bin", True)]
-
-    def test_a_single_file_keeps_its_times_and_has_no_label(self, tmp_path):
-        events = sample_events(3)
-        events["t"] += 5_000_000
-        path = put(tmp_path / "a.dat", dat_bytes(events))
-        done = convert(path, tmp_path / "o.mcap")
-        with open_recording(tmp_path / "o.mcap") as recording:
-            np.testing.assert_array_equal(np.concatenate([*recording]), events)
-            assert recording.labels == []
-            assert recording.resolution == (240, 304)
-        assert (done.samples, done.events) == (0, 50)
 
     def test_a_file_too_large_to_hold_is_read_twice_with_the_same_result(self, ncars, tmp_path, monkeypatch):
         convert(ncars, tmp_path / "held.mcap")
@@ -231,18 +250,25 @@ class TestConvert:
         convert(ncars, out, overwrite=True)
         assert len(samples_of(out)) == 12
 
-    def test_what_the_encoding_cannot_hold_names_the_file(self, tmp_path):
-        path = put(tmp_path / "a.txt", b"20 1 2 1\n10 1 2 1\n")
-        with pytest.raises(InputError, match=r"a\.txt: evt3 needs events in order"):
-            convert(path, tmp_path / "o.mcap", encoding="evt3")
-
     @pytest.mark.parametrize(
         "arguments",
-        [{"gap_us": 0}, {"limit": 0}, {"split_every": 1}, {"split_every": 5, "split": "train"}],
+        [
+            {"gap_us": 0},
+            {"limit": 0},
+            {"interleaved": 1},
+            {"interleaved": 5, "split": "train"},
+            {"hold_out": (1, 5), "interleaved": 5},
+        ],
     )
     def test_arguments_out_of_range(self, ncars, tmp_path, arguments):
         with pytest.raises(InputError):
             convert(ncars, tmp_path / "o.mcap", **arguments)
+
+
+@pytest.mark.parametrize("text", ["", "5", "0/5", "6/5", "1/1", "1/5000", "a/b", "1/-5"])
+def test_what_is_no_block_names_the_option(text):
+    with pytest.raises(InputError, match="--hold-out"):
+        parse_hold_out(text)
 
 
 def test_real_nmnist_event_for_event(shared_data, tmp_path):

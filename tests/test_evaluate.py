@@ -14,7 +14,6 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import tiny
-from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -22,7 +21,7 @@ from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_c
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
-from streamfeat.evaluate.methods import make_features, random_filters, spherical_means
+from streamfeat.evaluate.methods import make_features
 from streamfeat.evaluate.page import tiled
 from streamfeat.evaluate.plan import METHODS, Cell, Trial, parse_sweep, plan_cells
 from streamfeat.evaluate.run import StateFile, evaluate, state_path
@@ -30,6 +29,7 @@ from streamfeat.evaluate.splits import DataSet, Fold
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
 from streamfeat.learn.chunks import ChunkedVolumes
+from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.volumes import windows_of
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Packet, Sample, open_recording
 from streamfeat.report.machine import PeakMemory
@@ -124,7 +124,11 @@ def test_nothing_is_learned_from_what_is_held_out(tmp_path):
         (tiny.labelled_items(6, names=("cat",)), 5, "all samples are labelled 'cat'"),
         (tiny.labelled_items(6, names=("cat", "")), 2, "3 of 6 samples have no label, the first is sample 1"),
         (tiny.labelled_items(6), 0, "--folds 0 leaves nothing"),
-        (tiny.labelled_items(6), 5, "label 'cat' has 2 samples, fewer than 5 folds"),
+        (
+            tiny.labelled_items(6),
+            5,
+            "bad.mcap: label 'cat' has 2 training samples, 5-fold cross-validation needs 5",
+        ),
     ],
 )
 def test_data_that_cannot_be_split(tmp_path, items, folds, what):
@@ -139,7 +143,11 @@ def test_only_held_out_samples_are_refused(tmp_path):
 
 def test_on_train_what_is_held_out_is_not_there(animals, tmp_path):
     data = DataSet([animals], None, 4, 0, "train")
-    assert (data.scored, data.n_folds) == ("4 folds of the training samples, without those held out", 4)
+    assert data.n_folds == 4
+    assert data.scored == (
+        "4 folds, each a block of neighbouring samples of every class of the training samples, without those "
+        "held out"
+    )
     with open_recording(animals) as recording:
         every = list(recording.samples())
     kept = [sample for sample in every if sample.label.split == "train"]
@@ -200,12 +208,12 @@ def test_cells_are_the_base_and_one_change_at_a_time():
 
 
 def test_what_a_method_does_not_use_makes_no_other_cell():
-    base = {"iterations": 3, "log_det": 0.2, "coherence": 0.3, "patch": 5}
+    base = {"iterations": 3, "rows": "free", "log_det": 0.2, "coherence": 0.3, "patch": 5}
     direct, inverse, kmeans, counts = plan_cells(["direct", "inverse", "kmeans", "counts"], base, [], 1)
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    assert counts.key == {"method": "counts", "setting": {"mirror": False}, "fold": 0}
+    assert counts.key == {"method": "counts", "setting": {"mirror": False, "kernel": "linear"}, "fold": 0}
 
 
 @pytest.mark.parametrize(
@@ -223,7 +231,7 @@ def test_any_value_of_a_setting_can_be_swept(text, values):
     name, found = parse_sweep(text)
     assert name == text.partition("=")[0].replace("-", "_")
     assert found == values
-    cells = plan_cells(["direct"], {}, [(name, found)], 1)
+    cells = plan_cells(["direct"], {"rows": "free"}, [(name, found)], 1)
     assert [getattr(cell.setting, name) for cell in cells[1:]] == values
 
 
@@ -240,6 +248,8 @@ def test_any_value_of_a_setting_can_be_swept(text, values):
         (["--sweep", "encoding=soft,"], "give names, such as --sweep encoding=soft,split"),
         (["--sweep", "mirror=maybe"], "give yes and no, such as --sweep mirror=yes,no"),
         (["--on", "test"], "--on test is unknown; choose held-out or train"),
+        (["--kernel", "cubic"], "kernel is 'cubic', it must be linear or rbf"),
+        (["--groups", "video"], "--groups video is unknown; choose from block, source, none"),
         (["--sweep", "encoding=loud"], "encoding is 'loud'"),
         (["--method", "counts", "--sweep", "bins=2"], "--sweep bins: none of counts uses it"),
         (["--preset", "best"], "there is no preset 'best'"),
@@ -327,14 +337,33 @@ def test_random_filters_are_directions():
 # --- scores
 
 
-def test_the_bootstrap_interval_is_that_of_resampled_samples():
+def in_digits(hits):
+    """A digit for each sample."""
+    return "".join("01"[int(hit)] for hit in hits)
+
+
+def test_the_interval_of_samples_is_that_of_resampled_samples():
     hits = np.arange(200) < 170
     rng = np.random.default_rng(1)
     means = [rng.choice(hits, 200).mean() for _ in range(4000)]
     np.testing.assert_allclose(
-        scores.bootstrap_interval(170, 200), np.percentile(means, (2.5, 97.5)), atol=0.006
+        scores.accuracy_interval(in_digits(hits), np.arange(200)),
+        np.percentile(means, (2.5, 97.5)),
+        atol=0.006,
     )
-    assert scores.bootstrap_interval(7, 7) == (1, 1)
+    assert scores.accuracy_interval("1111111", np.arange(7)) == (1, 1)
+
+
+def test_the_interval_of_units_is_that_of_units_drawn_whole():
+    rng = np.random.default_rng(2)
+    units = np.repeat(np.arange(30), rng.integers(1, 20, 30))
+    hits = rng.random(len(units)) < rng.random(30)[units]  # alike within a unit
+    parts = [hits[units == unit] for unit in range(30)]
+    means = [np.concatenate([parts[i] for i in rng.integers(0, 30, 30)]).mean() for _ in range(4000)]
+    found = scores.accuracy_interval(in_digits(hits), units)
+    np.testing.assert_allclose(found, np.percentile(means, (2.5, 97.5)), atol=0.012)
+    alone = scores.accuracy_interval(in_digits(hits), np.arange(len(hits)))
+    assert found[1] - found[0] > 1.5 * (alone[1] - alone[0])
 
 
 def test_a_paired_interval_is_that_of_resampled_pairs():
@@ -343,19 +372,13 @@ def test_a_paired_interval_is_that_of_resampled_pairs():
     hits = np.where(rng.random(300) < 0.1, rng.random(300) < 0.9, base)
     drawn = rng.integers(0, 300, (4000, 300))
     differences = (hits[drawn].astype(int) - base[drawn]).mean(axis=1)
-    digits = ["".join("01"[int(hit)] for hit in row) for row in (hits, base)]
+    digits, units = [in_digits(hits), in_digits(base)], np.arange(300)
     expected = np.percentile(differences, (2.5, 97.5))
-    np.testing.assert_allclose(scores.paired_interval(*digits), expected, atol=0.006)
-    assert scores.paired_interval(digits[0], digits[0]) == (0, 0)
+    np.testing.assert_allclose(scores.paired_interval(*digits, units), expected, atol=0.006)
+    assert scores.paired_interval(digits[0], digits[0], units) == (0, 0)
     # Narrower than two intervals of their own: most samples are the same to both.
-    alone = scores.bootstrap_interval(int(base.sum()), 300)
+    alone = scores.accuracy_interval(digits[1], units)
     assert expected[1] - expected[0] < 0.7 * (alone[1] - alone[0])
-
-
-def test_the_interval_of_folds_is_students():
-    values = [0.8, 0.9, 0.85, 0.7]
-    expected = student.interval(0.95, 3, np.mean(values), np.std(values, ddof=1) / 2)
-    np.testing.assert_allclose(scores.fold_interval(values), expected)
 
 
 def test_confusion_has_true_labels_in_rows():
@@ -584,6 +607,9 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
             assert difference["low"] <= difference["accuracy"] <= difference["high"]
             (first,) = (r for r in base if r["method"] == row["method"])
             assert difference["accuracy"] == pytest.approx(row["accuracy"] - first["accuracy"], abs=2e-4)
+    for row in base[1:]:
+        to_first = row["difference"]["accuracy"]
+        assert to_first == pytest.approx(row["accuracy"] - base[0]["accuracy"], abs=2e-4)
     assert {row["method"] for row in result["rows"] if row["swept"] == "mirror"} == set(METHODS)
     for row in base:
         assert row["early"]["samples"] == 4
@@ -609,7 +635,10 @@ def test_folds_and_the_papers_figures_in_the_terminal(unsplit):
         "--folds", "2", "--early-samples", "3", "--method", "direct", "--sweep", "bins=2",
     )  # fmt: skip
     assert run.exit_code == 0, run.output
-    assert "2 stratified folds (Student's t)" in " ".join(run.stdout.split())
+    said = " ".join(run.stdout.split())
+    assert "split: 2 folds, each a block of neighbouring samples of every class" in said
+    assert "95 % bootstrap interval over runs of neighbouring samples" in said
+    assert re.search(r"method fold 1 fold 2 direct [01]\.\d{3} [01]\.\d{3}", said)
     line = next(line.split() for line in run.stdout.splitlines() if line.startswith("7 "))
     assert line == ["7", "0.771", "0.784"]  # not measured here: only the paper's direct and inverse
 

@@ -15,6 +15,7 @@ from live_net import PATIENCE_S, free_port, plain_publisher, plain_session
 
 import streamfeat as sf
 from streamfeat.messages.packets import PacketWriter
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.replay import ReplayJob
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -92,7 +93,7 @@ def test_reading_with_plain_mcap(monkeypatch, tmp_path, capsys):
         RECORDINGS / "digits_classifier.safetensors",
         emit="1s",
     )
-    job.run(recording_out=tmp_path / "out.mcap")
+    job.run(Outputs(recording=tmp_path / "out.mcap"))
     run_as_said(monkeypatch, "read_with_mcap", tmp_path / "out.mcap")
     lines = capsys.readouterr().out.splitlines()
     assert sum(" s  label " in line for line in lines) == 100

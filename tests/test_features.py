@@ -106,8 +106,30 @@ def test_features_come_as_a_data_frame(digits):
 
 def test_what_is_not_a_sample_is_refused(digits):
     _, test, encoder = digits
-    with pytest.raises(InputError, match="sample 1 is of type ndarray; give labelled samples"):
+    with pytest.raises(InputError, match="sample 1 is an array of events without a resolution"):
         sf.EventFeatures(encoder).transform([test[0], test[1].events])
+    for wrong in ([1, 2], np.zeros((3, 4)), "events", None, (1, 2, 3)):
+        with pytest.raises(InputError, match=r"sample 1 is of type [a-zA-Z]+; give labelled samples"):
+            sf.EventFeatures(encoder, resolution=(34, 34)).transform([test[0], wrong])
+
+
+def test_event_arrays_have_the_features_of_the_offline_path(digits):
+    _, test, encoder = digits
+    arrays = [sample.events for sample in test[:6]]
+    expected = [encoder.encode(events, (34, 34)) for events in arrays]
+    step = sf.EventFeatures(encoder, resolution=(34, 34))
+    assert np.array_equal(step.transform(arrays), expected)
+    pairs = [(events, (34, 34)) for events in arrays]
+    assert np.array_equal(sf.EventFeatures(encoder).transform(pairs), expected)
+    # Of another tool, and beside samples.
+    other = np.zeros(len(arrays[0]), [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
+    for name, theirs in (("t", "t"), ("x", "x"), ("y", "y"), ("p", "on")):
+        other[theirs] = arrays[0][name]
+    mixed = step.transform([other, test[1]])
+    assert np.array_equal(mixed[0], expected[0])
+    assert np.array_equal(mixed[1], step.transform([test[1]])[0])
+    assert step.transform([]).shape == (0, encoder.n_features)
+    assert clone(step).resolution == (34, 34)
 
 
 def test_a_mirror_image_swaps_left_and_right():

@@ -1,6 +1,6 @@
 """Hostile bytes: a short run of every target, and every input that ever failed.
 
-Long runs, guided by coverage: `python tools/torture --only bytes`.
+Long runs, guided by coverage: `python tests/torture --only bytes`.
 """
 
 import contextlib
@@ -22,6 +22,8 @@ import tiny
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from safetensors.numpy import save
+from torture.fuzz import Watch, all_targets, random_inputs
+from torture.mutate import mend_mcap, mend_zip
 
 from streamfeat.camera_files.event_files import read_events
 from streamfeat.engine.encoder import Encoder
@@ -31,8 +33,6 @@ from streamfeat.events import EVENT_DTYPE
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS
 from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter, recover
-from tools.torture.fuzz import Watch, all_targets, random_inputs
-from tools.torture.mutate import mend_mcap, mend_zip
 
 TARGETS = all_targets()
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,7 +77,7 @@ def test_the_same_bytes_give_the_same(name):
 
 @pytest.mark.parametrize("mode", ["NUMBA_BOUNDSCHECK", "NUMBA_DISABLE_JIT"])
 def test_payloads_within_bounds_and_uncompiled_give_the_same(mode, tmp_path):
-    """`python tools/torture --only bytes` does it with the kernels of engines, too."""
+    """`python tests/torture --only bytes` does it with the kernels of engines, too."""
     payloads = [
         data[3:][: len(data) // 2 * 2 - 4]
         for encoding in PAYLOAD_ENCODINGS

@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -20,16 +21,37 @@ ROOMS = {
     "kernels": {"events"},
     "files": {"errors"},
     "work": {"errors"},
-    "engine": {"errors", "events", "files", "kernels"},
+    "report": {"errors", "files"},
+    "engine": {"errors", "events", "files", "kernels", "report"},
     "messages": {"errors", "events", "files", "kernels"},
+    "denoise": {"errors", "events", "kernels", "messages"},
     "simulate": {"events"},
     "camera_files": {"errors", "events", "files", "messages"},
-    "recordings": {"camera_files", "errors", "events", "files", "messages"},
-    "report": {"errors", "files"},
-    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "work"},
+    "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
+    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
-    "convert": {"camera_files", "errors", "events", "files", "messages", "recordings", "work"},
-    "stream": {"classify", "engine", "errors", "events", "files", "kernels", "messages", "recordings"},
+    "convert": {
+        "camera_files",
+        "classify",
+        "denoise",
+        "errors",
+        "events",
+        "files",
+        "messages",
+        "recordings",
+        "work",
+    },
+    "stream": {
+        "classify",
+        "denoise",
+        "engine",
+        "errors",
+        "events",
+        "files",
+        "kernels",
+        "messages",
+        "recordings",
+    },
     "evaluate": ALL_ABOVE,
     "latency": ALL_ABOVE,
     "live": ALL_ABOVE,
@@ -40,7 +62,7 @@ ROOMS = {
 """Each room, and the rooms above it that it may import from."""
 
 ONLY_IN = {
-    "asyncio": {"stream", "latency"},
+    "asyncio": {"stream", "latency", "view"},
     "mcap": {"recordings"},
     "zenoh": {"live"},
     "prometheus_client": {"live"},
@@ -53,7 +75,9 @@ ONLY_IN = {
     "dask": {"work"},
     "distributed": {"work"},
     "foxglove": {"view"},
+    "websockets": {"view"},
     "numba": {"kernels", "latency", "cli"},
+    "llvmlite": {"kernels", "cli"},
 }
 """The rooms that may import a library."""
 
@@ -161,7 +185,8 @@ def test_a_library_is_imported_where_it_belongs(library):
 @pytest.mark.parametrize("name", sorted(n for n in NAMES if n.startswith("kernels.")))
 def test_kernels_know_nothing_but_arrays(name):
     outside = {i.partition(".")[0] for i in imports_of(NAMES[name])} - {"streamfeat"}
-    assert outside <= {"math", "numpy", "numba", "typing"}
+    more = {"kernels.compiled": {"collections"}, "kernels.vectors": {"llvmlite"}}.get(name, set())
+    assert outside <= {"math", "numpy", "numba", "typing"} | more
     assert {i.partition(".")[0] for i in own_imports(NAMES[name])} <= {"kernels", "events"}
 
 
@@ -202,7 +227,7 @@ def test_nothing_in_a_module_can_run_what_it_reads_or_reorder_floats(name):
             )
 
 
-@pytest.mark.parametrize("name", sorted(n for n in NAMES if n.startswith("kernels.")))
+@pytest.mark.parametrize("name", sorted({n for n in NAMES if n.startswith("kernels.")} - {"kernels.vectors"}))
 def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
         if isinstance(node, ast.FunctionDef):
@@ -212,6 +237,13 @@ def test_kernels_are_compiled_in_one_way(name):
             else:  # makes arrays, whose references must be counted
                 options = {keyword.arg: keyword.value.value for keyword in decorator.keywords}
                 assert options == {"cache": True, "nogil": True}
+
+
+def test_vector_code_is_generated_in_one_module_and_in_one_way():
+    """`kernels.vectors` offers functions that write machine code, and no others."""
+    functions = [node for node in tree_of(NAMES["kernels.vectors"]).body if isinstance(node, ast.FunctionDef)]
+    generated = {f.name for f in functions if [ast.unparse(d) for d in f.decorator_list] == ["generated"]}
+    assert generated == set(importlib.import_module("streamfeat.kernels.vectors").__all__)
 
 
 @modules(packages=True)
@@ -227,5 +259,43 @@ def test_what_a_module_offers_exists_and_is_described(name):
             assert inspect.getdoc(value), item
 
 
-def test_the_package_offers_about_a_dozen_names():
-    assert len(streamfeat.__all__) <= 16
+def test_the_package_offers_about_twenty_names():
+    assert len(streamfeat.__all__) <= 22
+    assert set(streamfeat.__all__) == {*streamfeat._HOMES, "__version__"}
+    assert set(dir(streamfeat)) >= set(streamfeat.__all__)
+
+
+PAGES = [
+    page
+    for folder in (".", "recordings", "streamfeat", "tests", "tools")
+    for page in PACKAGE.parent.glob(f"{folder}/**/*.md" if folder != "." else "*.md")
+]
+
+
+def test_links_of_pages_lead_to_files_and_headings():
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for link in re.findall(r"\]\(\s*([^)\s]+)\s*\)", text):
+            if link.startswith(("http:", "https:")):
+                continue
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            assert target.exists(), f"{page}: {link}"
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                anchors = {re.sub(r"[^a-z0-9 _-]", "", h.lower()).replace(" ", "-") for h in headings}
+                assert anchor in anchors, f"{page}: {link}"
+
+
+def test_the_front_page_is_short():
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 300
+    assert len(text.encode()) <= 20_000
+
+
+def test_tests_import_no_tools():
+    for path in (PACKAGE.parent / "tests").rglob("*.py"):
+        for node in ast.walk(tree_of(path)):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not any(name.split(".")[0] == "tools" for name in modules), path

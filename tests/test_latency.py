@@ -22,7 +22,7 @@ from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.latency.end_to_end import measure_end_to_end, without_silence
-from streamfeat.latency.histogram import PERCENTILES, Latencies
+from streamfeat.latency.histogram import PERCENTILES, Latencies, RecentLatencies
 from streamfeat.latency.measure import LatencyReport
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.text import spell
@@ -570,3 +570,20 @@ def test_a_page_is_not_replaced_by_half_of_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(InputError, match="cannot write there"):
         write_report(tmp_path / "no" / "page.html", "title", [])
+
+
+def test_recent_latencies_are_those_of_the_latest_values():
+    recent = RecentLatencies()
+    assert recent.percentiles(50, 99) == []
+    for i in range(1000):
+        recent.add(1_000 * (i + 1))
+    (first, half), (second, most) = recent.percentiles(50, 99)
+    assert (first, second) == ("p50", "p99")
+    assert half == pytest.approx(500e-6, rel=2e-3)
+    assert most == pytest.approx(990e-6, rel=2e-3)
+    for _ in range(140_000):
+        recent.add(5e9)
+    assert recent.percentiles(1)[0][1] == pytest.approx(5.0, rel=1e-3)  # the thousand are forgotten
+    recent.add(-1)
+    recent.add(1e18)
+    assert recent.percentiles(100)[0][1] == pytest.approx(60.0, rel=1e-3)

@@ -16,7 +16,7 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.learn.fit import geometry_of, learn_encoder
-from streamfeat.learn.settings import DEFAULTS, PRESETS, THRESHOLDS, Setting, preset_with
+from streamfeat.learn.settings import DEFAULTS, PRESETS, THRESHOLD, Setting, preset_with
 from streamfeat.learn.volumes import Volumes, Window, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recordings.reader import Label, open_recording
@@ -240,7 +240,8 @@ def test_learn_encoder(recording, formulation):
         learn(recording, formulation=formulation, report=lambda *step: told.append(step)) for _ in range(2)
     )
     assert (model.n_filters, model.formulation, model.geometry) == (7, formulation, tiny.GEOMETRY)
-    assert (model.encoding, model.threshold) == ("split", THRESHOLDS[formulation])
+    assert (model.encoding, model.threshold) == ("split", THRESHOLD)
+    np.testing.assert_allclose(np.linalg.norm(model.filters, axis=1), 1, atol=1e-6)
     assert model.fingerprint == again.fingerprint
     assert model.provenance["windows"] == 6
     assert model.provenance["volumes"] == 200
@@ -261,9 +262,10 @@ def test_learn_encoder(recording, formulation):
     ],
 )
 def test_weights_of_the_penalty_reach_the_learner(recording, formulation, weights):
-    usual = learn(recording, formulation=formulation)
+    rows = {"rows": "free" if formulation == "direct" else "unit"}
+    usual = learn(recording, formulation=formulation, **rows)
     for name, weight in weights.items():
-        model = learn(recording, formulation=formulation, **{name: weight})
+        model = learn(recording, formulation=formulation, **rows, **{name: weight})
         assert model.provenance["weights"] == usual.provenance["weights"] | {name: weight}
         assert model.fingerprint != usual.fingerprint
 
@@ -287,8 +289,11 @@ def test_an_interrupted_encoder_is_one_to_go_on_from(recording, tmp_path, formul
     part.save(tmp_path / "part")
     part = Encoder.load(tmp_path / "part")
     rest = learn(recording, resume=part, formulation=formulation, iterations=3)
-    assert (rest.provenance["interrupted"], rest.provenance["iterations"]) == (False, 5)
-    assert [len(rest.provenance[name]) for name in ("objective", "condition", "coherence")] == [10, 5, 5]
+    assert not rest.provenance["interrupted"]
+    done = rest.provenance["iterations"]
+    assert 2 < done <= 5
+    lengths = [len(rest.provenance[name]) for name in ("objective", "condition", "coherence")]
+    assert lengths == [2 * done, done, done]
     if formulation == "direct":
         assert rest.fingerprint == whole.fingerprint
         assert rest.provenance == whole.provenance
@@ -329,8 +334,9 @@ def test_an_interruption_before_anything_was_learned_gives_no_encoder(recording)
         ({"stride": 3}, r"has geometry .*stride=4.* not .*stride=3"),
         ({"formulation": "inverse"}, "has formulation direct, not inverse"),
         ({"encoding": "soft"}, "has encoding split, not soft"),
-        ({"threshold": 0.7}, "has threshold 0.5, not 0.7"),
-        ({"log_det": 0.7}, r"has weights .*'log_det': 0.1.* not .*'log_det': 0.7"),
+        ({"threshold": 0.7}, "has threshold 1.0, not 0.7"),
+        ({"lambda0": 0.7}, "has lambda0 2.0, not 0.7"),
+        ({"rows": "free", "lambda0": 2.0}, "has rows unit, not free"),
         ({"filters": 8}, "has filters 7, not 8"),
         ({"volumes": 100}, r"learned from other volumes \(200 of a.mcap, seed 4\)"),
         ({"seed": 5}, "learned from other volumes"),
@@ -370,12 +376,41 @@ def test_going_on_from_other_recordings_or_a_model_without_history_is_refused(re
         ({"coherence": -1.0}, "coherence is -1.0, it must be finite and not negative"),
         ({"conditioning": 0.1, "formulation": "inverse"}, "conditioning is a weight of the direct"),
         ({"log_det": 0.1, "formulation": "inverse"}, "log_det is a weight of the direct"),
+        ({"log_det": 0.1}, "log_det is a weight for filters of any length; give --rows free"),
+        ({"rows": "free", "formulation": "inverse"}, "free rows are for the direct formulation"),
+        ({"start": "zero"}, "start is 'zero', it must be one of kmeans, random"),
+        ({"lambda0": -1.0}, "lambda0 is -1.0"),
     ],
 )
 def test_bad_settings_are_refused_before_any_work(change, reason):
     with pytest.raises(InputError, match=reason) as refusal:
         Setting(**LEARN | change)
     assert "\n" not in str(refusal.value)
+
+
+def test_free_filters_are_scaled_and_can_be_gone_on_from(recording):
+    free = {"rows": "free", "filters": 7}
+    whole = learn(recording, **free, iterations=5)
+    np.testing.assert_allclose(np.linalg.norm(whole.filters, axis=1), 1, rtol=1e-6)
+    part = learn(recording, **free, iterations=2)
+    rest = learn(recording, resume=part, **free, iterations=3)
+    assert np.ptp(whole.provenance["lengths"]) > 0.01
+    np.testing.assert_allclose(rest.filters, whole.filters, atol=1e-3)
+
+
+def test_the_two_thresholds_do_two_things(recording):
+    usual = learn(recording)
+    assert np.array_equal(learn(recording, threshold=0.7).filters, usual.filters)
+    assert learn(recording, threshold=0.7).threshold == 0.7
+    other = learn(recording, lambda0=0.7)
+    assert (other.threshold, other.provenance["lambda0"]) == (usual.threshold, 0.7)
+    assert not np.array_equal(other.filters, usual.filters)
+
+
+def test_a_short_recording_gives_as_many_volumes_as_were_asked_for(tmp_path):
+    path = tiny.write_items(tmp_path / "second.mcap", [tiny.packet(tiny.steady(0, 1_000_000, 3000))])
+    with open_recording(path) as recording:
+        assert learn(recording, volumes=12_500).provenance["volumes"] == 12_500
 
 
 def test_presets():
@@ -390,7 +425,7 @@ def test_presets():
 def test_a_recording_of_too_few_volumes_is_refused(tmp_path):
     path = tiny.write_items(tmp_path / "b.mcap", tiny.labelled_items(1, events=3))
     with open_recording(path) as recording, pytest.raises(InputError, match="too few volumes") as refusal:
-        learn(recording, volumes=1000, filters=900)
+        learn(recording, volumes=10_000, filters=9000)
     assert "\n" not in str(refusal.value)
 
 

@@ -16,7 +16,7 @@ from streamfeat.cli import main
 from streamfeat.errors import InputError
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.live.network import FoundTopic, find_topics, open_session
+from streamfeat.live.network import FoundTopic, Network, find_topics, open_session
 from streamfeat.live.record import RecordJob
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import recover
@@ -46,6 +46,7 @@ def files(tmp_path_factory):
     return compiled(folder)
 
 
+@pytest.mark.real_time
 def test_listen_ends_well_when_interrupted(files, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `export` is not installed")
     port, out, table = free_port(), tmp_path / "out.mcap", tmp_path / "out.parquet"
@@ -82,6 +83,7 @@ def test_listen_ends_well_when_interrupted(files, tmp_path):
     assert {len(scores) for scores in rows["scores"].to_pylist()} == {3}
 
 
+@pytest.mark.real_time
 def test_record_survives_a_kill_with_all_but_the_last_chunk(files, tmp_path):
     """`kill -9` between two chunks, and in the midst of one: what was made safe is there, in order."""
     port, target = free_port(), tmp_path / "drive.mcap"
@@ -104,7 +106,7 @@ def test_record_survives_a_kill_with_all_but_the_last_chunk(files, tmp_path):
         process.wait()
     assert not target.exists()
     with pytest.raises(InputError, match="streamfeat recover"):
-        RecordJob(PlainNames("cam/*/events"), target, port=port).run()
+        RecordJob(PlainNames("cam/*/events"), target, network=Network(port=port)).run()
     recover(part, target)
     with open_recording(target) as recording:
         got = np.concatenate(list(recording))
@@ -123,11 +125,12 @@ def saved(part, copy):
         return recording.n_events
 
 
+@pytest.mark.real_time
 def test_a_silent_recording_is_safe_too(tmp_path):
     """Chunks are closed by the clock, not by the next message."""
     port, target, copy = free_port(), tmp_path / "drive.mcap", tmp_path / "copy.mcap"
     part = tmp_path / "drive.mcap.part"
-    job = RecordJob(PlainNames("cam/*/events"), target, port=port, chunk_s=0.05)
+    job = RecordJob(PlainNames("cam/*/events"), target, network=Network(port=port), chunk_s=0.05)
     with (
         plain_session(port, listen=True) as net,
         running(job),
@@ -140,9 +143,10 @@ def test_a_silent_recording_is_safe_too(tmp_path):
             assert (recording.n_events, recording.topic) == (200, "/cam/a/events")
 
 
+@pytest.mark.real_time
 def test_publish_until_interrupted(files):
     port = free_port()
-    job = ListenJob(PlainNames("cam/*/events"), files / "model", port=port)
+    job = ListenJob(PlainNames("cam/*/events"), files / "model", network=Network(port=port))
     with running(job):
         words = ["publish", files / "labelled.mcap", "cam/a/events", "--loop", "--speed", "5"]
         with started(*words, "--port", port, "--wait", "60", "--json") as publisher:
@@ -159,6 +163,7 @@ def test_publish_until_interrupted(files):
     assert heard["packets"] + heard["lost"] == published["packets"]
 
 
+@pytest.mark.real_time
 def test_topics(capsys, monkeypatch):
     port = free_port()
     with plain_session(port, listen=True) as net:

@@ -22,9 +22,12 @@ from live_net import (
 from test_live_listen import MODEL, batches, listener, message, replayed
 
 from streamfeat.live.names import PlainNames
-from streamfeat.live.network import open_session
+from streamfeat.live.network import Network, open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
+from streamfeat.stream.outputs import Outputs
+
+pytestmark = pytest.mark.real_time
 
 KEY = "cam/a/events"
 
@@ -84,9 +87,9 @@ def program(text, *words):
 
 def test_a_publisher_that_is_killed_and_another_in_its_place(files):
     port, sink, sent = free_port(), ListSink(), batches(10)
-    job = listener(files, emit="10ms", port=port, classifier=False)
+    job = listener(files, emit="10ms", network=Network(port=port), classifier=False)
     end = int(sent[-1]["t"][-1])
-    with running(job, more=sink):
+    with running(job, Outputs(more=sink)):
         for life, gid in enumerate((b"1" * 16, b"2" * 16)):
             words = config("peer", connect=[port], listen=[0]), KEY, gid.hex()
             with program(PUBLISHER, *words) as publisher:
@@ -113,11 +116,11 @@ def test_a_router_that_is_killed_and_another_in_its_place(files, tmp_path):
     port, sink, sent = free_port(), ListSink(), iter(range(10**6))
     path = tmp_path / "client.json5"
     path.write_text(config("client", connect=[port]))
-    job = listener(files, emit="10ms", classifier=False, zenoh_config=path)
+    job = listener(files, emit="10ms", classifier=False, network=Network(path))
 
     with program(ROUTER, config("router", listen=[port])) as router:
         router.stdout.readline()
-        with open_session(path) as net, running(job, more=sink), plain_publisher(net, KEY) as camera:
+        with open_session(path) as net, running(job, Outputs(more=sink)), plain_publisher(net, KEY) as camera:
 
             def put():
                 i = next(sent)
@@ -212,8 +215,8 @@ def test_what_a_cut_link_loses_is_recovered_if_both_sides_ask_for_it(files, tmp_
     port, sink, sent = free_port(), ListSink(), batches(60, events=50)
     here, there = tmp_path / "here.json5", tmp_path / "there.json5"
     here.write_text(config("peer", listen=[port]))
-    job = listener(files, emit="10ms", classifier=False, zenoh_config=here, reliable=reliable)
-    with running(job, more=sink):
+    job = listener(files, emit="10ms", classifier=False, network=Network(here, reliable=reliable))
+    with running(job, Outputs(more=sink)):
         until(lambda: listens(port), "a listener")
         cable = Cable(port)
         there.write_text(config("client", connect=[cable.port]))

@@ -3,7 +3,9 @@
 import threading
 import time
 
-from streamfeat.live.inbox import Inbox, RawMessage
+import pytest
+
+from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.stream.cameras import CameraLeft
 
 SECOND = 1_000_000_000
@@ -46,6 +48,7 @@ def test_full_of_bytes_it_drops_the_oldest_and_tells_the_next_of_the_topic():
     assert inbox.take(0)[0] == CameraLeft("a")
 
 
+@pytest.mark.real_time
 def test_what_has_waited_too_long_is_dropped():
     inbox, now = Inbox(max_delay_s=1000.0), time.monotonic_ns()
     for i in range(10):
@@ -65,6 +68,7 @@ def test_a_message_larger_than_all_is_not_kept():
     assert inbox.take(0)[0].dropped == 1
 
 
+@pytest.mark.real_time
 def test_closing_wakes_who_waits_and_keeps_what_is_there():
     inbox, got = Inbox(), []
     thread = threading.Thread(target=lambda: got.append(inbox.take(30)))
@@ -78,3 +82,24 @@ def test_closing_wakes_who_waits_and_keeps_what_is_there():
     inbox.put(raw())
     assert len(inbox.take(0)) == 1
     assert inbox.take(0) is None
+
+
+def test_announcements_without_end_are_refused_and_counted():
+    inbox = Inbox()
+    for i in range(300_000):
+        inbox.put(Announcement(f"made-up/{i}", here=True))
+    inbox.put(raw(number=7))
+    assert inbox.depth == 4097
+    assert inbox.refused == 300_000 - 4096
+    taken = [item for _ in range(65) for item in inbox.take(0)]
+    assert numbers(taken) == [7]
+    inbox.put(Announcement("made-up/last", here=True))
+    assert inbox.take(0) == [Announcement("made-up/last", here=True)]
+
+
+def test_topics_without_end_cost_no_memory_when_their_messages_are_dropped():
+    inbox = Inbox(max_bytes=1512)
+    for i in range(20_000):
+        inbox.put(raw(f"made-up/{i}"))
+    assert inbox.dropped == 19_999
+    assert len(inbox._dropped) == 4096

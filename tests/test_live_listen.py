@@ -30,6 +30,7 @@ from streamfeat.errors import InputError
 from streamfeat.live import intake
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
+from streamfeat.live.network import Network
 from streamfeat.live.publish import PublishJob
 from streamfeat.live.record import RecordJob
 from streamfeat.live.screen import HealthTable
@@ -37,7 +38,10 @@ from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, 
 from streamfeat.messages.codecs import encode
 from streamfeat.recordings.reader import open_recording
 from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.session import Session
+
+pytestmark = pytest.mark.real_time
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)
@@ -55,7 +59,12 @@ def files(tmp_path_factory):
 
 
 def listener(files, expression="cam/*/events", classifier=True, **options):
-    options = {"silence_s": NEVER, "patience_s": NEVER, "max_delay_s": NEVER, "port": free_port()} | options
+    options = {
+        "silence_s": NEVER,
+        "patience_s": NEVER,
+        "max_delay_s": NEVER,
+        "network": Network(port=free_port()),
+    } | options
     chosen = files / "classifier" if classifier else None
     return ListenJob(PlainNames(expression), files / "model", chosen, **options)
 
@@ -96,8 +105,8 @@ def same(emissions, expected):
 
 def test_features_over_zenoh_are_those_of_a_replay_of_the_recording_made_meanwhile(files, tmp_path):
     port, sent = free_port(), batches(60)
-    job = listener(files, emit="10ms", port=port)
-    recorder = RecordJob(PlainNames("cam/*/events"), tmp_path / "meanwhile.mcap", port=port)
+    job = listener(files, emit="10ms", network=Network(port=port))
+    recorder = RecordJob(PlainNames("cam/*/events"), tmp_path / "meanwhile.mcap", network=Network(port=port))
     with plain_session(port, listen=True) as net, running(job), running(recorder):
         features = Collector(net, "cam/a/features")
         predictions = Collector(net, "cam/a/prediction")
@@ -136,9 +145,9 @@ def recorder_count(recorder):
 
 def test_a_wildcard_serves_cameras_that_come_and_go(files, tmp_path):
     port, sink = free_port(), ListSink()
-    job = listener(files, emit="1000ev", port=port, classifier=False)
+    job = listener(files, emit="1000ev", network=Network(port=port), classifier=False)
     output = tmp_path / "out.mcap"
-    with plain_session(port, listen=True) as net, running(job, more=sink, recording_out=output):
+    with plain_session(port, listen=True) as net, running(job, Outputs(more=sink, recording=output)):
         with plain_publisher(net, "cam/a/events") as camera:
             for i, events in enumerate(batches(5)):
                 camera.put(message(events, i), attachment=attachment(i + 1))
@@ -169,12 +178,16 @@ def test_published_recordings_arrive_whole_and_labelled(files, tmp_path):
     port, sink = free_port(), ListSink()
     items = tiny.labelled_items(6)
     recording = tiny.write_items(tmp_path / "labelled.mcap", items)
-    job = listener(files, emit="1000ev", port=port, learn_online=True)
+    job = listener(files, emit="1000ev", network=Network(port=port), learn_online=True)
     keys = ["cam/a/events", "cam/b/events"]
     publishing = PublishJob(
-        [(recording, key) for key in keys], PlainNames(keys[0]), speed=None, port=port, wait_s=30
+        [(recording, key) for key in keys],
+        PlainNames(keys[0]),
+        speed=None,
+        network=Network(port=port),
+        wait_s=30,
     )
-    with running(job, more=sink):
+    with running(job, Outputs(more=sink)):
         publishing.run()
         # The last sample has no label after it: the camera leaves, and that ends it.
         until(lambda: job.result()["samples"] == 12)
@@ -190,12 +203,12 @@ def test_published_recordings_arrive_whole_and_labelled(files, tmp_path):
 def test_word_that_a_camera_leaves_may_overtake_its_last_packets(files, monkeypatch):
     """zenoh sends declarations before data: who leaves is released when nothing has come for a while."""
     port, sink, sent = free_port(), ListSink(), batches(12)
-    job = listener(files, emit="10ms", port=port)
+    job = listener(files, emit="10ms", network=Network(port=port))
     key = "cam/a/events"
     monkeypatch.setattr(intake, "GRACE_S", NEVER)
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, key) as camera,
     ):
         for life, gid in enumerate((b"1" * 16, b"2" * 16)):
@@ -219,10 +232,10 @@ def test_word_that_a_camera_leaves_may_overtake_its_last_packets(files, monkeypa
 
 def test_a_silent_camera_decays_to_nothing(files):
     port, sink = free_port(), ListSink()
-    job = listener(files, emit="20ms", port=port, silence_s=0.05, classifier=False)
+    job = listener(files, emit="20ms", network=Network(port=port), silence_s=0.05, classifier=False)
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         camera.put(message(tiny.steady(10_000, 20_000, 50)), attachment=attachment(1))
@@ -243,10 +256,10 @@ def test_a_silent_camera_decays_to_nothing(files):
 @pytest.mark.parametrize("emit", ["event", "10ms", "auto"])
 def test_a_clock_that_starts_anew_is_followed_at_once(files, emit):
     port, sink, hour = free_port(), ListSink(), 3_600_000_000
-    job = listener(files, emit=emit, port=port, classifier=False)
+    job = listener(files, emit=emit, network=Network(port=port), classifier=False)
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, start in enumerate((30 * hour, 10_000, 7 * hour)):
@@ -268,9 +281,9 @@ def test_a_clock_that_starts_anew_is_followed_at_once(files, emit):
 
 def test_gaps_mark_a_window_and_no_more(files):
     port, sink = free_port(), ListSink()
-    job = listener(files, emit="10ms", port=port, classifier=False)
+    job = listener(files, emit="10ms", network=Network(port=port), classifier=False)
     sent = batches(30)
-    with plain_session(port, listen=True) as net, running(job, more=sink):
+    with plain_session(port, listen=True) as net, running(job, Outputs(more=sink)):
         features = Collector(net, "cam/a/features")
         with plain_publisher(net, "cam/a/events") as camera:
             for i, events in enumerate(sent):
@@ -307,12 +320,12 @@ class HeldSink(ListSink):
 
 def test_overload_drops_the_oldest_whole_packets_and_says_so(files, monkeypatch):
     port, sink = free_port(), HeldSink()
-    job = listener(files, emit="event", port=port, classifier=False, patience_s=0.05)
+    job = listener(files, emit="event", network=Network(port=port), classifier=False, patience_s=0.05)
     job._inbox._max_bytes = 400_000
     sent = batches(1000, events=1000)
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(sent):
@@ -361,12 +374,12 @@ def hostile_payloads():
 
 def test_bad_input_is_counted_by_reason_and_the_stream_goes_on(files):
     port, sink, lines = free_port(), ListSink(), []
-    job = listener(files, emit="1000ev", port=port, classifier=False)
+    job = listener(files, emit="1000ev", network=Network(port=port), classifier=False)
     job._warnings._say = lines.append
     cases = hostile_payloads()
     sent = batches(len(cases), events=20)
     started = time.monotonic()
-    with plain_session(port, listen=True) as net, running(job, more=sink):
+    with plain_session(port, listen=True) as net, running(job, Outputs(more=sink)):
         bad_key = "cam/bad/events"
         with plain_publisher(net, bad_key) as bad, plain_publisher(net, "cam/good/events") as good:
             for i, ((payload, _), events) in enumerate(zip(cases, sent, strict=True)):
@@ -393,14 +406,14 @@ def test_bad_input_is_counted_by_reason_and_the_stream_goes_on(files):
 
 def test_events_outside_a_sensor_that_changes_its_size(files):
     port, sink = free_port(), ListSink()
-    job = listener(files, emit="1000ev", port=port, classifier=False)
+    job = listener(files, emit="1000ev", network=Network(port=port), classifier=False)
     wide = tiny.steady(0, 1000, 100, resolution=(12, 40))
     outside = int(np.count_nonzero(wide["x"] >= tiny.RESOLUTION[1]))
     assert 0 < outside < 100
     small = tiny.steady(2000, 3000, 100, resolution=(8, 8))
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         camera.put(message(wide, 0), attachment=attachment(1))
@@ -414,10 +427,10 @@ def test_events_outside_a_sensor_that_changes_its_size(files):
 
 def test_two_cameras_on_one_key(files):
     port, sink = free_port(), ListSink()
-    job = listener(files, emit="1000ev", port=port, classifier=False)
+    job = listener(files, emit="1000ev", network=Network(port=port), classifier=False)
     with (
         plain_session(port, listen=True) as net,
-        running(job, more=sink),
+        running(job, Outputs(more=sink)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(batches(40)):
@@ -433,7 +446,7 @@ def test_two_cameras_on_one_key(files):
 def test_topics_without_end_are_refused(files, monkeypatch):
     monkeypatch.setattr(intake, "MAX_TOPICS", 5)
     port = free_port()
-    job = listener(files, "**", emit="1000ev", port=port, classifier=False)
+    job = listener(files, "**", emit="1000ev", network=Network(port=port), classifier=False)
     with plain_session(port, listen=True) as net, running(job), plain_publisher(net, "x/**") as camera:
         for i in range(40):
             net.put(f"x/{i}", message(tiny.stream([5])), attachment=attachment(1))
@@ -452,7 +465,7 @@ def test_topics_without_end_are_refused(files, monkeypatch):
 )
 def test_labels_that_make_no_sense(files, label, reason):
     port = free_port()
-    job = listener(files, emit="1000ev", port=port, learn_online=True)
+    job = listener(files, emit="1000ev", network=Network(port=port), learn_online=True)
     with (
         plain_session(port, listen=True) as net,
         running(job),
@@ -473,7 +486,7 @@ def test_labels_that_make_no_sense(files, label, reason):
 def test_reliable_late_joiners_get_history_and_nothing_is_missed(files, tmp_path):
     port, sink = free_port(), ListSink()
     recording = tiny.write_items(tmp_path / "r.mcap", [tiny.packet(b) for b in batches(50)])
-    job = listener(files, emit="1000ev", port=port, classifier=False, reliable=True)
+    job = listener(files, emit="1000ev", network=Network(port=port, reliable=True), classifier=False)
     from streamfeat.live.network import open_session
     from streamfeat.live.publisher import CameraSink
     from streamfeat.messages.packets import PacketWriter
@@ -483,7 +496,7 @@ def test_reliable_late_joiners_get_history_and_nothing_is_missed(files, tmp_path
         packets = [m for item in rec.items() for m in writer.messages(item.events, item.resolution)]
         camera = CameraSink(net, PlainNames("cam/a/events"), "cam/a/events", reliable=True, block=True)
         camera.write(packets[:30])
-        with running(job, more=sink):
+        with running(job, Outputs(more=sink)):
             until(lambda: job.result()["packets"] == 30, "history")
             camera.write(packets[30:])
             until(lambda: job.result()["packets"] == 50)
@@ -494,7 +507,7 @@ def test_reliable_late_joiners_get_history_and_nothing_is_missed(files, tmp_path
 
 def test_metrics_tell_what_the_summary_tells(files):
     port, metrics = free_port(), free_port()
-    job = listener(files, emit="10ms", port=port, metrics=f"127.0.0.1:{metrics}")
+    job = listener(files, emit="10ms", network=Network(port=port), metrics=f"127.0.0.1:{metrics}")
     with (
         plain_session(port, listen=True) as net,
         running(job),
@@ -536,10 +549,10 @@ class Terminal(io.StringIO):
 def test_a_terminal_shows_one_table_of_the_figures_of_the_metrics(files):
     port, terminal = free_port(), Terminal()
     console = Console(file=terminal, width=120, height=40, force_terminal=True, color_system=None)
-    job = listener(files, emit="10ms", port=port)
+    job = listener(files, emit="10ms", network=Network(port=port))
     with (
         plain_session(port, listen=True) as net,
-        running(job, console=console),
+        running(job, Outputs(console=console)),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(batches(20)):
@@ -562,7 +575,10 @@ def test_a_terminal_shows_one_table_of_the_figures_of_the_metrics(files):
     text = io.StringIO()
     with (
         plain_session(port := free_port(), listen=True) as net,
-        running(listener(files, emit="10ms", port=port), console=Console(file=text, width=120)),
+        running(
+            listener(files, emit="10ms", network=Network(port=port)),
+            Outputs(console=Console(file=text, width=120)),
+        ),
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(batches(3)):
@@ -583,9 +599,9 @@ def test_what_cannot_work_is_said_at_once(files, tmp_path):
     config = tmp_path / "zenoh.json5"
     config.write_text("{mode: 'planet'}")
     with pytest.raises(InputError, match="zenoh cannot use this configuration"):
-        listener(files, zenoh_config=config).run()
+        listener(files, network=Network(config)).run()
     with pytest.raises(InputError, match="zenoh cannot use this configuration"):
-        listener(files, zenoh_config=tmp_path / "none.json5").run()
+        listener(files, network=Network(tmp_path / "none.json5")).run()
     port = free_port()
     with plain_session(port, listen=True), pytest.raises(InputError, match="cannot listen there"):
         listener(files, metrics=f"127.0.0.1:{port}").run()

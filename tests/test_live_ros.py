@@ -12,8 +12,11 @@ from mcap_ros2.decoder import DecoderFactory  # an independent reader of CDR
 from streamfeat.events import make_events
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames, RosNames
-from streamfeat.live.network import FoundTopic, find_topics
+from streamfeat.live.network import FoundTopic, Network, find_topics
 from streamfeat.live.publish import PublishJob
+from streamfeat.stream.outputs import Outputs
+
+pytestmark = pytest.mark.real_time
 
 MODEL = tiny.encoder(k=3)
 HASH = "RIHS01_d6fa176260b1f37e5a40845305315e150a0f18191241eb64f407442aa29844aa"
@@ -54,14 +57,19 @@ def model(tmp_path_factory):
 def test_listening_to_a_ros_camera(model):
     port, sink = free_port(), ListSink()
     job = ListenJob(
-        RosNames("/event_camera/events"), model, emit="50ms", port=port, silence_s=1e9, patience_s=1e9
+        RosNames("/event_camera/events"),
+        model,
+        emit="50ms",
+        network=Network(port=port),
+        silence_s=1e9,
+        patience_s=1e9,
     )
     sent = [tiny.steady(i * 10_000, (i + 1) * 10_000, 100, seed=i) for i in range(12)]
     with plain_session(port, listen=True) as net:
         # As rmw_zenoh does: the topic of the features with `*` for the hash.
         out = Collector(net, "0/event_camera/features/streamfeat_msgs::msg::dds_::Features_/*")
         token = net.liveliness().declare_token(TOKEN)
-        with running(job, more=sink), net.declare_publisher(KEY) as camera:
+        with running(job, Outputs(more=sink)), net.declare_publisher(KEY) as camera:
             until(lambda: camera.matching_status.matching)
             for i, events in enumerate(sent):
                 camera.put(cdr(events, i, i * 10_000_000), attachment=attachment(i + 1, 10**18 + i))
@@ -97,7 +105,9 @@ def test_publishing_as_a_ros_camera(tmp_path):
     events = make_events([1, 2, 15], [3, 4, 11], [1, 0, 1], [1_000_000, 1_000_010, 1_000_500])
     recording = tiny.write_items(tmp_path / "r.mcap", [tiny.packet(events)])
     names = RosNames("/event_camera/events", 3)
-    job = PublishJob([(recording, "/event_camera/events")], names, speed=None, port=port, wait_s=30)
+    job = PublishJob(
+        [(recording, "/event_camera/events")], names, speed=None, network=Network(port=port), wait_s=30
+    )
     key = f"3/event_camera/events/{TYPE}/{HASH}"
     with plain_session(port, listen=True) as net:
         tokens = []
@@ -136,7 +146,7 @@ def test_publishing_as_a_ros_camera(tmp_path):
 
 def test_other_domains_and_other_types_are_not_heard(model):
     port = free_port()
-    job = ListenJob(RosNames("/event_camera/events", 5), model, port=port)
+    job = ListenJob(RosNames("/event_camera/events", 5), model, network=Network(port=port))
     events = tiny.steady(0, 1000, 10)
     with (
         plain_session(port, listen=True) as net,

@@ -16,7 +16,9 @@ from test_live_listen import MODEL, message
 
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.live.network import open_session
+from streamfeat.live.network import Network, open_session
+
+pytestmark = pytest.mark.real_time
 
 RULES = """{
   mode: "peer",
@@ -52,7 +54,7 @@ RULES = """{
     ],
   },
 }"""
-"""The example of the README."""
+"""The example of `streamfeat/live/README.md`."""
 
 
 class Authority:
@@ -138,7 +140,7 @@ def test_certificates_and_access_control(folder):
         PlainNames("robot/*/events"),
         folder / "model",
         emit="10ms",
-        zenoh_config=config,
+        network=Network(config),
         silence_s=1e9,
         patience_s=1e9,
         max_delay_s=1e9,

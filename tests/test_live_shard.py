@@ -15,10 +15,11 @@ from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import RosNames
-from streamfeat.live.network import open_session
+from streamfeat.live.network import Network, open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
 from streamfeat.messages.cdr import EventPacket, LabelMessage
+from streamfeat.stream.outputs import Outputs
 
 # --- which share
 
@@ -139,15 +140,19 @@ def own(shard, names):
     return [name for name in names if shard.has(f"cam/{name}")]
 
 
+@pytest.mark.real_time
 def test_every_camera_is_served_exactly_once(files):
     """With labels, which go where their camera goes; what the others leave out is counted, and not lost."""
     port, names = free_port(), "abcdefgh"
     shards = [Shard(i, 3) for i in range(3)]
     sinks = [ListSink() for _ in shards]
-    jobs = [listener(files, emit="10ms", port=port, shard=shard, learn_online=True) for shard in shards]
+    jobs = [
+        listener(files, emit="10ms", network=Network(port=port), shard=shard, learn_online=True)
+        for shard in shards
+    ]
     with plain_session(port, listen=True) as net, ExitStack() as stack:
         for job, sink in zip(jobs, sinks, strict=True):
-            stack.enter_context(running(job, more=sink))
+            stack.enter_context(running(job, Outputs(more=sink)))
         cameras = Cameras(net, names)
         cameras.until_served(names)
         heard = dict(cameras.sent)
@@ -185,12 +190,15 @@ def test_every_camera_is_served_exactly_once(files):
         assert len({publisher for _, publisher in served[name]}) == 1
 
 
+@pytest.mark.real_time
 def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
     """Each process asks for its own cameras alone; one that comes back later is heard again."""
     port, names = free_port(), "abcdef"
     shards = [Shard(i, 2) for i in range(2)]
     jobs = [
-        listener(files, emit="10ms", port=port, classifier=False, shard=shard, announced=True)
+        listener(
+            files, emit="10ms", network=Network(port=port), classifier=False, shard=shard, announced=True
+        )
         for shard in shards
     ]
     with plain_session(port, listen=True) as net, ExitStack() as stack:
@@ -218,11 +226,14 @@ def test_cameras_that_announce_themselves_are_heard_and_nobody_else(files):
         assert "other_shards_packets" not in result
 
 
+@pytest.mark.real_time
 def test_a_ros_camera_that_announces_itself_is_heard(files):
     port, sink, asked = free_port(), ListSink(), RosNames("/cam/*/events")
-    job = ListenJob(asked, files / "model", emit="10ms", port=port, announced=True, silence_s=1e9)
+    job = ListenJob(
+        asked, files / "model", emit="10ms", network=Network(port=port), announced=True, silence_s=1e9
+    )
     names = RosNames("/cam/a/events")
-    with open_session(port=port) as net, running(job, more=sink):
+    with open_session(port=port) as net, running(job, Outputs(more=sink)):
         others = RosNames("/other/events")
         cameras = [
             MessagePublisher(net, one, one.expression, EventPacket.SCHEMA_NAME, block=True)
@@ -248,11 +259,12 @@ import json, sys
 from pathlib import Path
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
+from streamfeat.live.network import Network
 from streamfeat.live.shard import Shard
 model, state, port, shard = sys.argv[1:]
 never = dict(silence_s=1e9, patience_s=1e9, max_delay_s=1e9, state_every_s=0.02)
 job = ListenJob(
-    PlainNames("cam/*/events"), Path(model), emit="10ms", port=int(port), state=Path(state),
+    PlainNames("cam/*/events"), Path(model), emit="10ms", network=Network(port=int(port)), state=Path(state),
     shard=Shard.parse(shard), **never,
 )
 job.run()
@@ -296,6 +308,7 @@ def ended(one):
     return json.loads(text)
 
 
+@pytest.mark.real_time
 def test_a_process_that_is_killed_and_started_again_takes_up_its_own_cameras(files, tmp_path):
     port, names = free_port(), "abcf"
     first, second = Shard(0, 2), Shard(1, 2)
@@ -336,10 +349,13 @@ def test_a_process_that_is_killed_and_started_again_takes_up_its_own_cameras(fil
     assert results[0]["lost"] == 0
 
 
+@pytest.mark.real_time
 def test_what_another_shard_serves_by_now_is_left_in_the_state(files, tmp_path):
     """Three shares where there were two: nobody goes on with a camera that is another's."""
     port, state, names = free_port(), tmp_path / "state", "abcf"
-    job = listener(files, emit="10ms", port=port, classifier=False, state=state, state_every_s=0.02)
+    job = listener(
+        files, emit="10ms", network=Network(port=port), classifier=False, state=state, state_every_s=0.02
+    )
     with plain_session(port, listen=True) as net, running(job):
         cameras = Cameras(net, names)
         cameras.until_served(names)

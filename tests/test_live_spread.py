@@ -15,7 +15,7 @@ pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
 from streamfeat.live.cluster import ClusterListen, ServedCamera
 from streamfeat.live.names import PlainNames, RosNames
-from streamfeat.live.network import TopicWatch, open_session
+from streamfeat.live.network import Network, TopicWatch, open_session
 from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.work.cluster import local
@@ -71,12 +71,13 @@ def counted(one):
     return sum(one[name] for name in ("packets", "lost", "dropped", "missed", "unheard"))
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("keeps_state", [False, True])
 def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, keeps_state):
     port, keys = free_port(), [f"robot/{i}/events" for i in range(4)]
     state = tmp_path / "state" if keeps_state else None
     lines = []
-    options = {"port": port, "emit": "10ms", "state": state, "say": lines.append}
+    options = {"network": Network(port=port), "emit": "10ms", "state": state, "say": lines.append}
     job = ClusterListen(PlainNames("robot/*/events"), two, model, **options)
     until(lambda: len(two.processes()) == 2, "two workers")
     with open_session(port=port) as session, running(job):
@@ -113,6 +114,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
     assert len([line for line in lines if "again on worker" in line]) == len(mourned)
 
 
+@pytest.mark.real_time
 def test_topics_are_found_by_their_tokens_alone():
     port, found = free_port(), []
     with (
@@ -129,10 +131,11 @@ def test_topics_are_found_by_their_tokens_alone():
             until(lambda: set(ros) == {"/cam1/events", "/cam2/events"})
 
 
+@pytest.mark.real_time
 def test_one_camera_without_a_wildcard_needs_no_token_and_a_configuration_goes_along(two, model, tmp_path):
     port, config = free_port(), tmp_path / "client.json5"
     config.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]}}))
-    job = ClusterListen(PlainNames("robot/0/events"), two, model, port=1, zenoh_config=config, emit="10ms")
+    job = ClusterListen(PlainNames("robot/0/events"), two, model, network=Network(config, 1), emit="10ms")
     with open_session(port=port) as session, running(job):
         publisher = session.declare_publisher("robot/0/events")
         until(lambda: publisher.matching_status.matching, "a subscriber")

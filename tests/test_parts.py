@@ -41,7 +41,7 @@ def test_parts_hold_everything_once(data, tmp_path_factory):
             time += 300
         writer.write_events(make_events([1], 0, 1, [time]), RESOLUTION)
     with open_recording(path) as recording:
-        starts = sorted(recording._known.chunk_starts)
+        starts = sorted(recording._source.cuts())
         cuts = sorted({0, *data.draw(st.lists(st.sampled_from(starts), max_size=4))})
         parts = [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
         for read in (Recording.items, Recording.samples):

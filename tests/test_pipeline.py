@@ -16,9 +16,11 @@ from streamfeat.errors import InputError
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
-from streamfeat.stream.replay import ReplayJob
+from streamfeat.stream.outputs import Outputs
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.replay import ReplayJob, parse_speed
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, TerminalSink
 
 MODEL = tiny.encoder(k=3)
@@ -80,6 +82,7 @@ def digits(tmp_path_factory):
     return tiny.write_digits(tmp_path_factory.mktemp("digits") / "digits.mcap", 12)
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("policy", ["10ms", "20ev", "1000ev"])
 @pytest.mark.parametrize("speed", [None, 1e6])
 def test_results_are_those_of_a_plain_loop(digits, policy, speed):
@@ -98,18 +101,21 @@ def test_results_are_those_of_a_plain_loop(digits, policy, speed):
     assert pipeline.stats().queued_in == pipeline.stats().queued_out == pipeline.stats().dropped == 0
 
 
+@pytest.mark.real_time
 def test_many_emissions_of_one_packet_are_handed_on_in_parts():
     sink = ListSink()
     asyncio.run(Pipeline([tiny.packet(tiny.steady(0, 50_000, 1000))], session("event"), [sink]).run())
     assert [len(part) for part in sink.parts] == [256, 256, 256, 232]
 
 
+@pytest.mark.real_time
 def test_nothing_in_nothing_out():
     sink = ListSink()
     asyncio.run(Pipeline([], session(), [sink]).run())
     assert (sink.parts, sink.closed) == ([], "done")
 
 
+@pytest.mark.real_time
 def test_what_is_there_does_not_wait_for_what_is_not():
     """A live source says None when it has nothing more: what it gave is read before it goes on."""
     sink, asked = ListSink(), threading.Event()
@@ -142,6 +148,7 @@ def live_source(packets, waits):
             yield None
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("policy", ["event", "10ms", "1000ev"])
 def test_what_nobody_need_do_beside_is_done_in_one_thread_and_is_the_same(policy):
     packets = [tiny.packet(tiny.steady(i * 5_000, (i + 1) * 5_000, 300, seed=i)) for i in range(60)]
@@ -163,6 +170,7 @@ def test_what_nobody_need_do_beside_is_done_in_one_thread_and_is_the_same(policy
     assert one.rests > 0
 
 
+@pytest.mark.real_time
 def test_a_sink_that_fails_in_the_reader_ends_everything():
     sink = BrokenSink()
 
@@ -176,6 +184,7 @@ def test_a_sink_that_fails_in_the_reader_ends_everything():
     assert sink.closed == "failed"
 
 
+@pytest.mark.real_time
 def test_a_live_source_that_says_nothing_can_be_left():
     """Nothing comes and nothing is said but that: whoever is cancelled need not wait for a packet."""
     asked, sink = threading.Event(), ListSink()
@@ -196,6 +205,7 @@ def test_a_live_source_that_says_nothing_can_be_left():
     assert sink.closed == "failed"
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("own", [True, False])
 def test_pipelines_side_by_side_end_well_on_a_signal(own):
     read, sinks = [[], []], [ListSink(), ListSink()]
@@ -233,6 +243,7 @@ def endless(packets_read, n_events=40_000):
         start += 5_000
 
 
+@pytest.mark.real_time
 def test_a_slow_sink_fills_bounded_queues_and_loses_nothing():
     read, sink = [], ListSink()
     sink.hold.clear()
@@ -264,6 +275,7 @@ def test_a_slow_sink_fills_bounded_queues_and_loses_nothing():
     assert sink.closed == "done"
 
 
+@pytest.mark.real_time
 def test_a_sink_that_fails_ends_everything(tmp_path):
     good, broken = ListSink(), BrokenSink()
     sinks = [
@@ -278,6 +290,7 @@ def test_a_sink_that_fails_ends_everything(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_a_source_that_fails_ends_everything(tmp_path):
     def source():
         yield tiny.packet(tiny.steady(0, 50_000, 100))
@@ -291,6 +304,7 @@ def test_a_source_that_fails_ends_everything(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_a_failing_session_ends_everything():
     sink = ListSink()
     items = [tiny.packet(tiny.steady(0, 100, 10)), tiny.packet(tiny.stream([1], resolution=(3, 3)), (3, 3))]
@@ -299,6 +313,7 @@ def test_a_failing_session_ends_everything():
     assert sink.closed == "failed"
 
 
+@pytest.mark.real_time
 def test_a_sink_that_cannot_be_closed_does_not_keep_others_open():
     class Stuck(ListSink):
         def close(self, *, failed):
@@ -312,6 +327,7 @@ def test_a_sink_that_cannot_be_closed_does_not_keep_others_open():
     assert first.closed == "failed"
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("speed", [None, 0.05])
 def test_stop_keeps_what_was_read(tmp_path, speed):
     read, sink, target = [], ListSink(), tmp_path / "out.mcap"
@@ -337,6 +353,7 @@ def test_stop_keeps_what_was_read(tmp_path, speed):
     assert list(tmp_path.iterdir()) == [target]
 
 
+@pytest.mark.real_time
 def test_cancelling_the_task_closes_sinks_as_failed(tmp_path):
     sink = ListSink()
 
@@ -353,6 +370,7 @@ def test_cancelling_the_task_closes_sinks_as_failed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_progress_is_told_in_order(digits):
     told = []
     with open_recording(digits) as recording:
@@ -362,6 +380,7 @@ def test_progress_is_told_in_order(digits):
     assert told == sorted(told)
 
 
+@pytest.mark.real_time
 def test_the_recorded_pace_is_kept():
     # One packet of 400 ms at twice its pace; it is cut, so that readings do not wait for its end.
     sink = ListSink()
@@ -457,12 +476,11 @@ def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
     (tmp_path / "out.mcap.part").write_bytes(b"left over")
     job = ReplayJob(digits, tmp_path / "model")
     with pytest.raises(InputError, match="left by a writer"):
-        job.run(recording_out=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl")
+        job.run(Outputs(recording=tmp_path / "out.mcap", json_lines=tmp_path / "out.jsonl"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "out.mcap.part"]
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", "", "1e9"])
-def test_bad_speeds_are_refused(tmp_path, digits, text):
-    MODEL.save(tmp_path / "model")
+def test_bad_speeds_are_refused(text):
     with pytest.raises(InputError, match="--speed"):
-        ReplayJob(digits, tmp_path / "model", speed=text)
+        parse_speed(text)

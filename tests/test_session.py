@@ -8,6 +8,7 @@ import tiny
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures, encode_samples, sample_end
+from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
@@ -110,13 +111,13 @@ def test_times_are_counted_from_the_start_of_a_sample():
 def test_auto_rests_four_times_as_long_as_reading_takes():
     clock = FakeClock()
     session = Session(MODEL, EmitPolicy.parse("auto"), clock=clock)
-    reading = session._read
+    reading = session._emit
 
     def slow_reading(*args, **options):
         clock.now += 1.0
         return reading(*args, **options)
 
-    session._read = slow_reading
+    session._emit = slow_reading
     read_at = []
     for i in range(40):
         clock.now = max(clock.now, 0.5 * i)
@@ -489,3 +490,38 @@ def test_who_is_behind_reads_less_and_loses_nothing(policy):
     session = Session(MODEL, EmitPolicy.parse("event"), is_behind=lambda _: next(calls))
     assert len(list(session.process(items[0]))) == 5 * 32 + 1
     assert session.stats().events == 400
+
+
+@pytest.mark.parametrize("policy", ["event", "1ev", "auto"])
+def test_an_event_behind_a_silence_does_not_turn_time_back(policy):
+    """Emissions in silence said that time had passed; an event before then comes late, and is used."""
+    session = Session(MODEL, EmitPolicy.parse(policy))
+    before = [
+        e
+        for item in (tiny.packet(tiny.stream([0, 10])), Watermark("", 60_000))
+        for e in session.process(item)
+    ]
+    after = list(session.process(tiny.packet(tiny.stream([20_000, 49_998]))))
+    assert before[-1].t_us == 50_000
+    assert after
+    assert [e.t_us for e in after] == [50_000] * len(after)
+    assert after[-1].n_events == 4
+
+
+def test_looking_ahead_is_bounded_in_columns():
+    """A rest takes a fraction of a millisecond, however large the sensor."""
+    asked = []
+
+    class Watched(Engine):
+        def prepare(self, columns):
+            asked.append(columns)
+            return super().prepare(columns)
+
+    clock = FakeClock()
+    session = Session(MODEL, EmitPolicy.parse("event"), clock=clock, engine=Watched)
+    for i in range(3):
+        list(session.process(tiny.packet(tiny.stream([1000 * i]))))
+        clock.now += 1.0
+        session.rest()
+    assert asked
+    assert max(asked) <= 4096

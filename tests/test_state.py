@@ -403,9 +403,10 @@ import sys
 from pathlib import Path
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
+from streamfeat.live.network import Network
 model, state, port, reliable = sys.argv[1:]
 never = dict(silence_s=1e9, patience_s=1e9, max_delay_s=1e9)
-never |= dict(port=int(port), reliable=reliable == "True", state=Path(state), state_every_s=0.02)
+never |= dict(network=Network(None, int(port), reliable == "True"), state=Path(state), state_every_s=0.02)
 job = ListenJob(PlainNames("cam/*/events"), Path(model), emit="10ms", **never)
 job.run()
 import json
@@ -439,6 +440,7 @@ def next_number(path):
     return topics[KEY]["delivery"]["next"] if KEY in topics else 0
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("reliable", [True, False])
 def test_a_listener_that_is_killed_goes_on_where_it_was(reliable, files, tmp_path):
     """What is put while nobody listens is recovered if both sides ask for it, or else lost and counted."""
@@ -541,3 +543,32 @@ def test_no_polarity_and_no_events_are_no_state():
     other.restore(session.snapshot())
     assert other.stats() == session.stats()
     assert other.stats().rejected == 1
+
+
+def test_the_format_of_a_state_is_that_of_its_version(sound):
+    """Files of version 1 were written by earlier programs: other names in them need another version."""
+    _, header = read_safetensors(sound, "state", 1)
+    camera, topic = header["cameras"][0], header["topics"][0]
+    assert set(header) - {"format", "version"} == {"fingerprint", "saved_ns", "topics", "cameras"}
+    assert set(camera) == {"topic", "moment", "stats", "resolution", "engine"}
+    assert set(camera["moment"]) == {
+        *("origin_us", "last_us", "next_us", "every_us", "unread", "epoch", "silent_us", "incomplete_us"),
+        *("lost", "seen_label", "sample"),
+    }
+    assert set(camera["stats"]) == {
+        *("events", "late", "rejected", "saturated", "emissions", "incomplete", "samples", "correct"),
+        "unknown_labels",
+    }
+    assert set(topic) == {
+        *("topic", "reader", "clock", "delivery", "resolution", "stream_us", "label_end_us", "lost"),
+    }
+
+
+def test_a_state_of_another_version_is_refused_in_one_line(sound, tmp_path):
+    arrays, header = read_safetensors(sound, "state", 1)
+    del header["format"], header["version"]
+    path = tmp_path / "later"
+    write_safetensors(path, "state", 2, arrays, header)
+    with pytest.raises(InputError, match=r"later: .*version") as caught:
+        Job(path)
+    assert "\n" not in str(caught.value)

@@ -10,6 +10,7 @@ from streamfeat.errors import InputError
 from streamfeat.recordings.reader import Label
 from streamfeat.stream import table
 from streamfeat.stream.emission import Emission
+from streamfeat.stream.outputs import Outputs
 
 pa = pytest.importorskip("pyarrow", reason="extra export is not installed")
 pq = pytest.importorskip("pyarrow.parquet", reason="extra export is not installed")
@@ -92,7 +93,7 @@ def test_a_replay_writes_a_table(tmp_path):
     clf = tiny.classifier(model)
     clf.save(tmp_path / "clf")
     job = ReplayJob(recording, tmp_path / "model", tmp_path / "clf", emit="20ms")
-    job.run(table=tmp_path / "out.parquet")
+    job.run(Outputs(table=tmp_path / "out.parquet"))
     found = pq.read_table(tmp_path / "out.parquet")
     assert found.num_rows == job.result()["emissions"]
     finals = [row for row in found.to_pylist() if row["final"]]

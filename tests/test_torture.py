@@ -1,17 +1,12 @@
 """The tool that breaks things, with a trial or two of each kind: it runs, counts, and all survives."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1]))
-
-from tools.torture import __main__ as torture
-from tools.torture import kills, soak
-from tools.torture.nursery import Nursery
-from tools.torture.table import Row, Trials, markdown
+from torture import __main__ as torture
+from torture import kills, soak
+from torture.nursery import Nursery
+from torture.table import Row, Trials, markdown
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """The direct formulation: an objective that is the published one, never rises and never stalls."""
 
+import functools
+
 import numpy as np
 import pytest
 import tiny
@@ -7,9 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 
+from streamfeat.errors import InputError
 from streamfeat.learn.initial import random_directions
 from streamfeat.learn.omega import Omega, condition_number, mutual_coherence
 from streamfeat.learn.transform import TransformLearner, _closed_form, _positive_root, _Quadratic, _update
+
+FreeLearner = functools.partial(TransformLearner, rows="free", start="random")
 
 D = 12
 
@@ -65,7 +70,7 @@ def best_of(problem, start):
     seed=st.integers(0, 2**32 - 1),
 )
 def test_the_objective_never_rises(k, d, threshold, conditioning, coherence, log_det, seed):
-    learner = TransformLearner(
+    learner = FreeLearner(
         k,
         threshold=threshold,
         conditioning=conditioning,
@@ -86,7 +91,7 @@ def test_the_objective_never_rises(k, d, threshold, conditioning, coherence, log
 @pytest.mark.parametrize("k", [40, 72, 110])
 def test_the_objective_never_rises_on_real_volumes(shared_data, k, omega):
     white = tiny.real_white_volumes(shared_data)
-    learner = TransformLearner(k, max_iter=8, tol=0.0, random_state=0, **omega).fit(white)
+    learner = FreeLearner(k, max_iter=8, tol=0.0, random_state=0, **omega).fit(white)
     assert_never_rises(learner.objective_, white)
     assert learner.objective_[-1] < learner.objective_[0]
 
@@ -96,8 +101,8 @@ def test_the_objective_never_rises_on_real_volumes(shared_data, k, omega):
 def test_the_objective_is_the_published_one(k, omega):
     white = tiny.white_volumes(300).astype(np.float64)
     make = {"threshold": 0.4, "tol": 0.0, "random_state": 0} | omega
-    last = TransformLearner(k, max_iter=2, **make).fit(white)
-    before = TransformLearner(k, max_iter=1, **make).fit(white)
+    last = FreeLearner(k, max_iter=2, **make).fit(white)
+    before = FreeLearner(k, max_iter=1, **make).fit(white)
     A = before.components_.astype(np.float64)
     z = white @ A.T
     codes = np.sign(z) * np.maximum(np.abs(z) - 0.4, 0)
@@ -170,7 +175,7 @@ def test_an_update_comes_near_the_minimum_where_the_closed_form_does_not(k, cohe
 @pytest.mark.parametrize("coherence", [0.1, 1.0])
 def test_coherence_alone_does_not_stall(coherence):
     white = tiny.white_volumes() * np.linspace(0.2, 3, D, dtype=np.float32)
-    learner = TransformLearner(
+    learner = FreeLearner(
         D + 9, conditioning=0, coherence=coherence, log_det=0, max_iter=200, tol=1e-7, random_state=0
     ).fit(white)
     # Where it stops, the gradient is zero, and not just the step refused.
@@ -187,8 +192,8 @@ def test_coherence_alone_does_not_stall(coherence):
 def test_condition_and_coherence_are_reported():
     white = tiny.white_volumes() * np.linspace(0.2, 3, D, dtype=np.float32)
     make = {"threshold": 0.1, "max_iter": 10, "random_state": 0}
-    bare = TransformLearner(20, coherence=0, log_det=0.01, **make).fit(white)
-    firm = TransformLearner(20, coherence=1, log_det=1, **make).fit(white)
+    bare = FreeLearner(20, coherence=0, log_det=0.01, **make).fit(white)
+    firm = FreeLearner(20, coherence=1, log_det=1, **make).fit(white)
     assert firm.condition_[-1] < bare.condition_[-1] / 2
     for learner in (bare, firm):
         assert learner.unused_ == 0
@@ -197,9 +202,7 @@ def test_condition_and_coherence_are_reported():
         unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
         cosines = [abs(unit[i] @ unit[j]) for i in range(20) for j in range(i)]
         assert learner.coherence_[-1] == pytest.approx(max(cosines), rel=1e-4)
-    narrow = [
-        TransformLearner(5, coherence=c, random_state=0).fit(white).coherence_[-1] for c in (0.0, 3.0, 30.0)
-    ]
+    narrow = [FreeLearner(5, coherence=c, random_state=0).fit(white).coherence_[-1] for c in (0.0, 3.0, 30.0)]
     assert narrow[0] > narrow[1] > narrow[2]
 
 
@@ -212,7 +215,7 @@ def test_condition_and_coherence_of_degenerate_rows():
 
 @pytest.mark.parametrize("omega", WEIGHTS)
 def test_a_threshold_above_all_codes_is_survived(omega):
-    learner = TransformLearner(D + 3, threshold=1e6, max_iter=3, random_state=0, **omega)
+    learner = FreeLearner(D + 3, threshold=1e6, max_iter=3, random_state=0, **omega)
     learner.fit(tiny.white_volumes())
     assert np.isfinite(learner.components_).all()
     assert learner.unused_ == D + 3
@@ -220,7 +223,51 @@ def test_a_threshold_above_all_codes_is_survived(omega):
 
 
 def test_fewer_filters_than_entries_have_the_other_determinant():
-    learner = TransformLearner(D // 2, log_det=0.3, max_iter=3, tol=0.0, random_state=0)
+    learner = FreeLearner(D // 2, log_det=0.3, max_iter=3, tol=0.0, random_state=0)
     learner.fit(tiny.white_volumes())
     assert np.isfinite(learner.objective_).all()
     assert learner.condition_[-1] < 10
+
+
+# --- unit rows
+
+
+@pytest.mark.parametrize("start", ["kmeans", "random"])
+def test_unit_rows_keep_their_length_and_lower_the_published_objective(start):
+    white = tiny.white_volumes()
+    learner = TransformLearner(20, threshold=0.5, start=start, max_iter=12, tol=0.0, random_state=0).fit(
+        white
+    )
+    np.testing.assert_allclose(np.linalg.norm(learner.components_, axis=1), 1, rtol=1e-6)
+    assert (np.diff(learner.objective_) <= 1e-9).all()
+    assert learner.objective_[-1] < learner.objective_[0] - 1e-3
+    # 1/2 |A X - L|^2 + lambda0 |L|_1 per volume, where |A X|^2 is that of white volumes.
+    codes = learner.transform(white).astype(float)
+    products = white.astype(float) @ learner.components_.T
+    fit = 0.5 * 20 + np.mean(np.sum(0.5 * codes**2 - products * codes + 0.5 * np.abs(codes), axis=1))
+    again = learner.set_params(warm_start=True, max_iter=1).fit(white)
+    assert again.objective_[0] == pytest.approx(fit, rel=1e-6)
+
+
+def test_unit_rows_are_in_the_direction_of_what_their_codes_respond_to():
+    white = tiny.white_volumes()
+    make = {"threshold": 0.4, "tol": 0.0, "random_state": 0}
+    before = TransformLearner(9, max_iter=1, **make).fit(white)
+    after = TransformLearner(9, max_iter=2, **make).fit(white)
+    z = white @ before.components_.T
+    expected = (np.sign(z) * np.maximum(np.abs(z) - 0.4, 0)).T @ white
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(after.components_, expected, atol=1e-4)
+
+
+def test_a_filter_that_nothing_uses_stays():
+    learner = TransformLearner(5, threshold=1e6, max_iter=2, tol=0.0, random_state=0)
+    learner.fit(tiny.white_volumes())
+    assert learner.unused_ == 5
+    np.testing.assert_allclose(np.linalg.norm(learner.components_, axis=1), 1, rtol=1e-6)
+
+
+def test_what_rows_and_start_can_be():
+    for wrong in ({"rows": "long"}, {"start": "zero"}):
+        with pytest.raises(InputError, match="must be"):
+            TransformLearner(5, **wrong).fit(tiny.white_volumes())

@@ -25,6 +25,7 @@ def board():
     opened.close()
 
 
+@pytest.mark.real_time
 def test_a_client_gets_what_is_shown(board):
     board.announce("/view")
     with Client(board.port) as client:
@@ -41,7 +42,8 @@ def test_a_client_gets_what_is_shown(board):
     assert channels["/view/events"]["schemaName"] == "foxglove.RawImage"
     assert channels["/view/status"]["metadata"] == ABOUT
     assert set(channels) == {
-        f"/view/{name}" for name in ("events", "bins", "volumes", "features", "prediction", "status")
+        f"/view/{name}"
+        for name in ("events", "bins", "volumes", "features", "prediction", "engine", "status")
     }
 
 
@@ -53,6 +55,7 @@ def test_who_comes_late_gets_what_was_shown_last(board):
         assert json.loads(client.message()[2]) == {"frame": 2}
 
 
+@pytest.mark.real_time
 def test_whoever_looks_is_noticed():
     looked = []
     board = LiveBoard(ABOUT, "test", 0, lambda: looked.append(1))
@@ -66,6 +69,7 @@ def test_whoever_looks_is_noticed():
         board.close()
 
 
+@pytest.mark.real_time
 def test_a_client_that_does_not_read_loses_pictures_and_holds_up_nobody(board):
     board.announce("/view")
     picture = np.zeros((480, 640), np.uint8)

@@ -22,6 +22,7 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 from streamfeat.cli import app
 from streamfeat.errors import InputError
 from streamfeat.live.names import PlainNames, RosNames
+from streamfeat.live.network import Network
 from streamfeat.live.publish import PublishJob
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
@@ -29,7 +30,7 @@ from streamfeat.view.job import View, prefix_of
 
 MODEL = tiny.encoder(k=3)
 CLASSIFIER = tiny.classifier(MODEL)
-ALL = {"events", "bins", "volumes", "features", "prediction", "status"}
+ALL = {"events", "bins", "volumes", "features", "prediction", "engine", "status"}
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def written(path):
 def to_file(files, tmp_path, recording, classifier=True, **options):
     out = tmp_path / "out.mcap"
     chosen = files / "classifier" if classifier else None
-    options = {"live_port": None, "recording_out": out, "speed": "max"} | options
+    options = {"web_port": None, "recording_out": out, "speed": None} | options
     view = View(files / recording, files / "model", chosen, **options)
     view.run()
     return view, written(out)
@@ -88,16 +89,18 @@ def test_a_file_holds_everything_there_is_to_see(files, tmp_path):
     view, found = to_file(files, tmp_path, "samples.mcap", emit="10ms")
     assert set(found) == ALL
     result = view.result()
-    assert result["frames"] == len(found["status"]) == len(found["events"]) == len(found["bins"])
+    assert result["frames"] == len(found["status"]) == len(found["events"])
+    assert len(found["bins"]) == len(found["engine"]) > 6
     assert result["frames_skipped"] == 0
     last = found["prediction"][-1][1]
     assert (last["samples"], last["right"]) == (6, result["correct"])
     assert len(last["scores"]) == 3
     assert last["sample"] == {"label": "owl", "start_s": pytest.approx(1.3), "final": True}
     status = found["status"][-1][1]
-    assert status["drops"] == {"dropped": 0, "late": 0, "rejected": 0, "lost": 0, "skipped": 0}
+    assert status["drops"] == {"late": 0, "rejected": 0, "lost": 0, "skipped": 0}
     assert (status["width"], status["height"]) == tiny.RESOLUTION[::-1]
-    assert 0 < status["active_volumes"] <= status["volumes"] == 12
+    engine = found["engine"][-1][1]
+    assert 0 <= engine["active_volumes"] <= engine["volumes"] == 12
     assert [status["frame"] for _, status in found["status"]] == list(range(1, result["frames"] + 1))
 
 
@@ -124,8 +127,8 @@ def test_one_event_is_enough(files, tmp_path):
     found = to_file(files, tmp_path, "one.mcap")[1]
     assert set(found) == ALL
     assert found["status"][0][1]["events"] == 1
-    assert found["status"][0][1]["active_volumes"] == 1
-    assert found["status"][0][1]["update_us"]["n"] == 1
+    assert found["engine"][0][1]["active_volumes"] == 1
+    assert found["engine"][0][1]["update_us"]["n"] == 1
 
 
 def test_a_view_that_fails_leaves_no_file(files, tmp_path, monkeypatch):
@@ -138,16 +141,19 @@ def test_a_view_that_fails_leaves_no_file(files, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_a_recording_begins_when_somebody_looks_and_its_end_stays(files):
     lines = []
-    view = View(files / "samples.mcap", files / "model", speed="max", emit="10ms", say=lines.append)
+    view = View(
+        files / "samples.mcap", files / "model", speed=None, emit="10ms", say=lines.append, foxglove_port=0
+    )
     with shown(view):
         until(lambda: any("waiting" in line for line in lines))
         port = int(lines[0].rpartition(":")[2])
         assert view.result()["emissions"] == 0
         with Client(port) as client:
             client.subscribe("/status")
-            until(lambda: any("that was all" in line for line in lines))
+            until(lambda: view.result()["samples"] == 6)
         emissions = view.result()["emissions"]
         assert emissions > 6
         with Client(port) as late:
@@ -178,6 +184,7 @@ def moving(camera):
         thread.join()
 
 
+@pytest.mark.real_time
 def test_live_topics_are_shown_and_not_answered(files):
     key, lines = "robot/cam/events", []
     port = free_port()
@@ -187,9 +194,10 @@ def test_live_topics_are_shown_and_not_answered(files):
         files / "classifier",
         emit="10ms",
         say=lines.append,
-        port=port,
+        foxglove_port=0,
+        network=Network(port=port),
     )
-    with shown(view, publish=False), plain_session(port) as session:
+    with shown(view), plain_session(port) as session:
         until(lambda: lines)
         answers = []
         session.declare_subscriber("robot/cam/features", lambda sample: answers.append(1))
@@ -203,15 +211,27 @@ def test_live_topics_are_shown_and_not_answered(files):
     assert view.result()["frames"] >= 1
 
 
+@pytest.mark.real_time
 def test_a_ros_camera_is_shown(files):
     names, port, lines = RosNames("/event_camera/events"), free_port(), []
     view = View(
-        names, files / "model", files / "classifier", emit="10ms", rate=1000, say=lines.append, port=port
+        names,
+        files / "model",
+        files / "classifier",
+        emit="10ms",
+        rate=1000,
+        say=lines.append,
+        foxglove_port=0,
+        network=Network(port=port),
     )
     camera = PublishJob(
-        [(files / "samples.mcap", "/event_camera/events")], names, speed=4.0, port=port, wait_s=30
+        [(files / "samples.mcap", "/event_camera/events")],
+        names,
+        speed=4.0,
+        network=Network(port=port),
+        wait_s=30,
     )
-    with shown(view, publish=False):
+    with shown(view):
         until(lambda: lines)
         with Client(int(lines[0].rpartition(":")[2])) as client:
             camera.run()
@@ -278,13 +298,13 @@ def invoke(*arguments):
     [
         (["nowhere.mcap"], "no such file|not there|cannot"),
         (["{samples}", "--rate", "0"], "--rate 0 is not possible"),
-        (["{samples}", "--no-live"], "shows nothing without -o"),
+        (["{samples}", "--no-web"], "shows nothing without --foxglove or -o"),
         (["{samples}", "--ros2", "/events"], "not both"),
         (["robot/*/events", "--loop"], "are for recordings"),
         (["robot/*/events", "--layout", "{folder}/x.json"], "needs the key of one camera"),
         ([], "give a zenoh key"),
         (["{samples}", "--split", "none"], "no samples of split"),
-        (["{samples}", "--no-live", "--web", "-o", "{folder}/x.mcap"], "--web needs"),
+        (["{samples}", "--speed", "no"], "--speed 'no' is not understood"),
     ],
 )
 def test_what_makes_no_sense_is_one_clear_line(files, arguments, message):
@@ -297,7 +317,7 @@ def test_what_makes_no_sense_is_one_clear_line(files, arguments, message):
 
 def test_a_missing_extra_is_named(files, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    outcome = invoke(files / "samples.mcap", "-m", files / "model")
+    outcome = invoke(files / "samples.mcap", "--foxglove")
     assert "pip install 'streamfeat[view]'" in str(outcome.exception)
 
 
@@ -309,10 +329,12 @@ def test_a_file_is_written_from_the_command_line(files, tmp_path):
     assert "exists already" in str(invoke(files / "samples.mcap", "-m", files / "model", "-o", out).exception)
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("looking", [False, True])
 def test_ctrl_c_ends_a_view(files, looking):
     command = [sys.executable, "-c", "from streamfeat.cli import main; main()", "view"]
-    command += [str(files / "samples.mcap"), "-m", str(files / "model"), "--port", "0", "--loop", "--json"]
+    command += [str(files / "samples.mcap"), "-m", str(files / "model"), "--foxglove", "--port", "0"]
+    command += ["--loop", "--json"]
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -341,6 +363,6 @@ def test_a_port_in_use_is_said_before_anything_is_shown(files):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        view = View(files / "samples.mcap", files / "model", live_port=0, web_port=taken.getsockname()[1])
+        view = View(files / "samples.mcap", files / "model", web_port=taken.getsockname()[1])
         with pytest.raises(InputError, match=r"--web-port .* cannot listen there: Address already in use"):
             view.run()

@@ -7,7 +7,7 @@ import tiny
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.window import count_window
 from streamfeat.view import observe
-from streamfeat.view.observe import ObservedEngine, Pace, Slot, Watch
+from streamfeat.view.observe import ObservedEngine, Slot, Throttle, Watch
 
 MODEL = tiny.encoder(k=3)
 GEOMETRY = MODEL.geometry
@@ -15,7 +15,7 @@ GEOMETRY = MODEL.geometry
 
 def watched(rate=1e9, look_ahead=False, **options):
     seen = []
-    watch = Watch("cam", Pace(rate, clock=None), seen.append)
+    watch = Watch("cam", Throttle(rate, clock=None), seen.append)
     return ObservedEngine(MODEL, tiny.RESOLUTION, watch=watch, look_ahead=look_ahead, **options), seen
 
 
@@ -82,16 +82,16 @@ def test_looks_are_no_more_frequent_than_asked_for():
     assert seen[-1].updates.n == 5
 
 
-def test_a_pace_follows_its_clock_and_starts_anew_when_time_goes_back():
+def test_a_throttle_follows_its_clock_and_starts_anew_when_time_goes_back():
     now = [0.0]
-    pace = Pace(10, clock=lambda: now[0])
-    assert [pace.is_due(0) for now[0] in (0, 0.05, 0.1, 0.19, 0.25, 0.1, 0.15)] == [1, 0, 1, 0, 1, 1, 0]
+    throttle = Throttle(10, clock=lambda: now[0])
+    assert [throttle.is_due(0) for now[0] in (0, 0.05, 0.1, 0.19, 0.25, 0.1, 0.15)] == [1, 0, 1, 0, 1, 1, 0]
 
 
 def test_what_nobody_takes_is_replaced_and_counted():
     slot = Slot()
     engine, _ = watched()
-    watch = Watch("cam", Pace(1e9, clock=None), slot.put)
+    watch = Watch("cam", Throttle(1e9, clock=None), slot.put)
     engine = ObservedEngine(MODEL, tiny.RESOLUTION, watch=watch)
     for i in range(5):
         engine.feed(tiny.steady(i * 1_000, (i + 1) * 1_000, 20, seed=i))

@@ -65,6 +65,7 @@ def test_many_bins_of_a_large_sensor_still_fit():
     assert picture.shape[1] < 1_700
 
 
+@pytest.mark.real_time
 def test_empty_volumes_are_told_from_quiet_ones():
     activity = np.array([[0, 1], [100, 400]])
     picture = volume_picture(activity)

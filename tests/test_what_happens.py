@@ -1,4 +1,4 @@
-"""The README's table of what happens when: each row has its tests, here or elsewhere."""
+"""The table of what happens when (`streamfeat/cli/README.md`): each row has its tests."""
 
 import ast
 import asyncio
@@ -23,8 +23,9 @@ from streamfeat.evaluate.run import StateFile
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import JsonLinesSink, RecordingSink
 
 ROOT = Path(__file__).parents[1]
@@ -101,9 +102,9 @@ ROWS = {
 
 
 def table():
-    """First cells of the README's table."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("## What happens when") : text.index("## Live\n")]
+    """First cells of the table."""
+    text = (ROOT / "streamfeat" / "cli" / "README.md").read_text(encoding="utf-8")
+    section = text[text.index("## What happens when") : text.index("## Security\n")]
     rows = re.findall(r"^\| (.*?) \|", section, re.MULTILINE)
     assert rows[0] == "when"
     return rows[1:]
@@ -221,6 +222,7 @@ def test_finished_cells_that_find_no_room(tmp_path):
 # --- signals
 
 
+@pytest.mark.real_time
 def test_a_signal_before_anything_runs_waits_until_it_can_be_heard(tmp_path):
     """Between opening an output and writing to it."""
     sink = JsonLinesSink(tmp_path / "out")
@@ -268,6 +270,7 @@ def wait_for(condition, process):
         time.sleep(0.01)
 
 
+@pytest.mark.real_time
 def test_a_replay_ends_on_sigterm_as_on_ctrl_c(home, tmp_path):
     target = tmp_path / "out.jsonl"
     words = ["replay", home / "few.mcap", "-m", home / "model", "--speed", "0.01", "--json-lines", target]
@@ -280,15 +283,17 @@ def test_a_replay_ends_on_sigterm_as_on_ctrl_c(home, tmp_path):
     assert list(tmp_path.iterdir()) == [target]
 
 
-WORDS = ["--patch", 4, "--stride", 4, "--bins", 2, "--filters", 7, "--window-ms", 100, "--volumes", 200]
+LONG = ["--patch", 8, "--filters", 200, "--volumes", 8000, "--lambda0", 0.1, "--iterations", 10**9]
+"""More than a hundred iterations of a fifth of a second, with the digits that ship."""
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("command", ["learn", "convert"])
 def test_sigterm_ends_a_command_as_ctrl_c_does(command, home, tmp_path):
-    """While it is at work: it would take hours, or long enough."""
+    """While it is at work, which would take much longer."""
     target = tmp_path / "out"
     if command == "learn":
-        words = [home / "few.mcap", "-o", target, *WORDS, "--formulation", "inverse", "--iterations", 10**9]
+        words = [ROOT / "recordings/digits_train.mcap", "-o", target, *LONG, "--formulation", "inverse"]
     else:
         for i in range(300):
             (home / f"data/Train/{i % 2}").mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console
 
 from streamfeat.cli import program
+from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.replay import ReplayJob
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,9 +30,9 @@ def main() -> None:
         recordings / "digits_test.mcap",
         recordings / "digits.safetensors",
         recordings / "digits_classifier.safetensors",
-        speed="20",
+        speed=20.0,
     )
-    job.run(console=console)
+    job.run(Outputs(console=console))
     program.out = console
     program.print_result(job.result(), "replayed", as_json=False)
     # Without the web fonts that rich would ask for: the picture makes no request.

@@ -11,18 +11,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-from browser import PATIENCE_S, Browser
-
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "tests"))
+
+from browser import PATIENCE_S, Browser  # noqa: E402
+
 PICTURE = ROOT / "tools" / "view.png"
 STAND_STILL = """
   const hear = listener.onMessage;
-  listener.onMessage = (channel, message) => {
+  listener.onMessage = (camera, channel, message) => {
     if (document.body.dataset.still) return;
-    hear(channel, message);
-    const { prediction } = model.last;
+    hear(camera, channel, message);
+    const prediction = model.cameras.get(model.camera)?.last.prediction;
     // At the end of a sample, with all bins filled, when the plots have something to show.
-    if (model.scores.length >= 80 && prediction.sample?.final) document.body.dataset.still = "yes";
+    if (model.scores.length >= 80 && prediction?.sample?.final) document.body.dataset.still = "yes";
   };
 """
 
@@ -33,13 +35,13 @@ def main() -> None:
         *(sys.executable, "-c", "from streamfeat.cli import main; main()", "view"),
         *(str(recordings / "digits_test.mcap"), "-m", str(recordings / "digits.safetensors")),
         *("-c", str(recordings / "digits_classifier.safetensors")),
-        *("--web", "--web-port", "0", "--port", "0"),
+        *("--web-port", "0", "--no-open"),
     ]
     view = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:
         said = iter(view.stderr.readline, "")
         address = next(line.partition(": ")[2].strip() for line in said if line.startswith("page"))
-        with Browser(1280, 864) as browser:
+        with Browser(1280, 930) as browser:
             browser.open(address)
             browser.until("Number(document.body?.dataset.frames) > 0")
             browser.value(STAND_STILL)

@@ -15,6 +15,7 @@ faery 0.7.1 ends the process, dv-processing 2.0.4 can hang, and eventcv 1.0.8 sa
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 from xml.etree import ElementTree
@@ -23,11 +24,17 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from streamfeat.camera_files.prophesee import Source, checked_resolution
+from streamfeat.camera_files.source import (
+    Contents,
+    Losses,
+    TableOptions,
+    checked_resolution,
+    chosen_stream,
+)
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution, make_events
+from streamfeat.events import Events, make_events
 
-__all__ = ["aedat4_resolution", "read_aedat4"]
+__all__ = ["open_aedat4"]
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 _LARGEST_HEADER = 1 << 20
@@ -45,13 +52,23 @@ class _Header:
         start: byte of the first packet.
         stop: byte of the index, or -1.
         compression: of the packets.
-        streams: type and `(width, height)` as text of each stream, by its number.
+        streams: by their numbers.
     """
 
     start: int
     stop: int
     compression: str
-    streams: dict[int, tuple[str, tuple[str, str]]]
+    streams: dict[int, "_Stream"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """Type, name and size of one stream, as text; empty where it is not said."""
+
+    kind: str
+    name: str
+    width: str
+    height: str
 
 
 class _Table:
@@ -92,19 +109,23 @@ class _Table:
         return int(value)
 
 
-def aedat4_resolution(path: Path) -> Resolution:
-    """`(height, width)` of the one event stream."""
+def open_aedat4(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """The event stream that is there, or the one of several that is chosen."""
     with path.open("rb") as raw:
-        _, (width, height) = _event_stream(path, _header(path, raw))
-    return checked_resolution(path, height, width)
+        header = _header(path, raw)
+    events = {number: stream for number, stream in header.streams.items() if stream.kind == "EVTS"}
+    names = tuple(stream.name or str(number) for number, stream in events.items())
+    if len(set(names)) < len(names):
+        names = tuple(str(number) for number in events)
+    number, stream = [*events.items()][chosen_stream(path, names, options.stream)]
+    resolution = None if options.resolution else checked_resolution(path, stream.height, stream.width)
+    return Contents(partial(_read_aedat4, path, header, number), resolution, header.start, names)
 
 
-def read_aedat4(file: Source) -> Iterator[Events]:
-    """Packets of the event stream; where one is damaged, those before it are kept."""
+def _read_aedat4(path: Path, header: _Header, number: int, losses: Losses) -> Iterator[Events]:
+    """Packets of one event stream; where one is damaged, those before it are kept."""
     n = 0
-    with file.path.open("rb") as raw:
-        header = _header(file.path, raw)
-        number, _ = _event_stream(file.path, header)
+    with path.open("rb") as raw:
         try:
             for stream, data in _packets(raw, header):
                 if stream == number:
@@ -113,8 +134,8 @@ def read_aedat4(file: Source) -> Iterator[Events]:
                     yield events
         except _DAMAGE as error:
             if n == 0:
-                raise InputError(f"{file.path}: damaged before the first event: {error}") from error
-            file.lose(0, f"everything after event {n} is lost: {error}")
+                raise InputError(f"{path}: damaged before the first event: {error}") from error
+            losses.lose(0, f"everything after event {n} is lost: {error}")
 
 
 def _header(path: Path, raw: BinaryIO) -> _Header:
@@ -140,15 +161,20 @@ def _header(path: Path, raw: BinaryIO) -> _Header:
         raise InputError(f"{path}: AEDAT4 header is cut short or damaged: {error}") from error
 
 
-def _streams(description: bytes) -> dict[int, tuple[str, tuple[str, str]]]:
+def _streams(description: bytes) -> dict[int, _Stream]:
     """The streams of an XML description: nodes of numbers, each with a type and a node `info`."""
     if b"<!" in description:  # no description has a document type, whose entities may grow without end
         raise ValueError("the description of the streams is none of DV's")
     streams = {}
     for node in ElementTree.fromstring(description.rstrip(b"\0")).iterfind("node[@name='outInfo']/node"):
-        name, size = node.get("name", ""), (_value(node, "info", "sizeX"), _value(node, "info", "sizeY"))
-        if name.isascii() and name.isdecimal() and len(name) < 10:
-            streams[int(name)] = _value(node, "", "typeIdentifier"), size
+        number = node.get("name", "")
+        if number.isascii() and number.isdecimal() and len(number) < 10:
+            streams[int(number)] = _Stream(
+                _value(node, "", "typeIdentifier"),
+                _value(node, "", "originalOutputName"),
+                _value(node, "info", "sizeX"),
+                _value(node, "info", "sizeY"),
+            )
     return streams
 
 
@@ -156,13 +182,6 @@ def _value(node: ElementTree.Element, child: str, key: str) -> str:
     inner = node.find(f"node[@name='{child}']") if child else node
     found = inner.find(f"attr[@key='{key}']") if inner is not None else None
     return (found.text or "") if found is not None else ""
-
-
-def _event_stream(path: Path, header: _Header) -> tuple[int, tuple[str, str]]:
-    found = [(number, size) for number, (kind, size) in header.streams.items() if kind == "EVTS"]
-    if len(found) != 1:
-        raise InputError(f"{path}: has {len(found)} event streams; only files with one are read")
-    return found[0]
 
 
 def _packets(raw: BinaryIO, header: _Header) -> Iterator[tuple[int, bytes]]:

@@ -1,12 +1,14 @@
-"""Containers that a library opens: Prophesee HDF5 by h5py, in a process of its own.
+"""Containers that a library opens: HDF5 by h5py, in a process of its own.
 
 Lives here: that process, what it tells, and what becomes of a file whose process does not end in order.
-Not here: what it does with h5py (`hdf5_process`), and columns (`tables`).
+Not here: what it does with h5py (`hdf5_process`), and columns (`columns`).
 """
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,50 +16,67 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.camera_files.columns import Layout, Rows, layout_of
 from streamfeat.camera_files.hdf5_process import FRAME
-from streamfeat.camera_files.prophesee import Source, declared_resolution
-from streamfeat.camera_files.tables import checked_events, named_columns, one_line
+from streamfeat.camera_files.source import Contents, Losses, TableOptions, checked_resolution, one_line
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution
+from streamfeat.events import Events
 
-__all__ = ["hdf5_resolution", "read_hdf5"]
+__all__ = ["open_hdf5"]
 
 
 class _DamageError(Exception):
     """The file, or what the library makes of it."""
 
 
-def hdf5_resolution(path: Path) -> Resolution | None:
-    """`(height, width)` of the attribute `geometry`, where there is one."""
-    try:
-        for kind, data in _frames(path):
-            if kind == b"g":
-                return declared_resolution(path, {"geometry": data.decode("ascii", "replace")})
-    except _DamageError as error:
-        raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
-    return None
-
-
-def read_hdf5(file: Source) -> Iterator[Events]:
-    """Rows of `CD/events`; where a chunk is damaged, those before it are kept."""
-    n = 0
+def open_hdf5(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """Find the event stream, its resolution, and what its columns are; reads the first block."""
+    about: dict[str, Any] = {}
     columns: dict[str, NDArray[Any]] = {}
     try:
-        for kind, data in _frames(file.path):
-            if kind == b"b":
-                events = checked_events(file.path, n, named_columns(file.path, columns))
-                yield events
-                n += len(events)
-                columns = {}
-            elif kind != b"g":
-                columns[kind.decode()] = np.load(BytesIO(data), allow_pickle=False)
+        for kind, data in _frames(path, options.stream):
+            if kind == b"i":
+                about = json.loads(data)
+            elif kind == b"b":
+                break
+            else:
+                columns[str(len(columns))] = np.load(BytesIO(data), allow_pickle=False)
     except _DamageError as error:
-        if n == 0:
-            raise InputError(f"{file.path}: damaged before the first event: {error}") from error
-        file.lose(0, f"everything after event {n} is lost: {error}")
+        raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
+    said = list(about["assumptions"])
+    layout: Layout | None = None
+    if columns:
+        layout = layout_of(path, [*columns.values()], about["names"], options, unit=about["unit"])
+        said += layout.assumptions
+    resolution = None
+    if about["resolution"] and not options.resolution:
+        resolution = checked_resolution(path, *about["resolution"])
+    read = partial(_read_hdf5, path, options.stream, layout, int(about["offset"]))
+    return Contents(read, resolution, 0, tuple(about["streams"]), tuple(said))
 
 
-def _frames(path: Path) -> Iterator[tuple[bytes, bytes]]:
+def _read_hdf5(
+    path: Path, stream: str | None, layout: Layout | None, offset_us: int, losses: Losses
+) -> Iterator[Events]:
+    """Rows of one event stream; where a chunk is damaged, those before it are kept."""
+    if layout is None:
+        return
+    rows = Rows(path, layout.unit, offset_us)
+    columns: list[NDArray[Any]] = []
+    try:
+        for kind, data in _frames(path, stream):
+            if kind == b"b":
+                yield rows.events({f: columns[i] for f, i in zip("txyp", layout.order, strict=True)})
+                columns = []
+            elif kind != b"i":
+                columns.append(np.load(BytesIO(data), allow_pickle=False))
+    except _DamageError as error:
+        if rows.n == 0:
+            raise InputError(f"{path}: damaged before the first event: {error}") from error
+        losses.lose(0, f"everything after event {rows.n} is lost: {error}")
+
+
+def _frames(path: Path, stream: str | None) -> Iterator[tuple[bytes, bytes]]:
     """What the other process tells, but for how it ended.
 
     Raises:
@@ -65,7 +84,14 @@ def _frames(path: Path) -> Iterator[tuple[bytes, bytes]]:
         _DamageError: the library gave up, or did not come to an end.
     """
     # -P: the folder that somebody works in is no place to import from.
-    command = [sys.executable, "-P", "-m", "streamfeat.camera_files.hdf5_process", str(path.resolve())]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "streamfeat.camera_files.hdf5_process",
+        str(path.resolve()),
+        stream or "",
+    ]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
         assert process.stdout

@@ -1,8 +1,8 @@
-"""One foreign event file -> batches of events.
+"""One camera file of another tool -> batches of events.
 
-Lives here: which format a file has, its resolution where it says so, and its events, read lazily in batches.
-Not here: the formats themselves (`words`, `aedat4`, `containers`, `tables`), folders and labels (`datasets`),
-and MCAP (`streamfeat.recordings.reader`).
+Lives here: which format a file has, its resolution, what was assumed, and its events, read lazily in batches.
+Not here: the formats themselves (`prophesee`, `aedat`, `text`, ...), folders and labels
+(`streamfeat.convert.datasets`), and MCAP (`streamfeat.recordings.reader`).
 """
 
 from collections.abc import Callable, Iterator
@@ -11,60 +11,116 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.camera_files.aedat4 import aedat4_resolution, read_aedat4
-from streamfeat.camera_files.containers import hdf5_resolution, read_hdf5
+from streamfeat.camera_files.aedat import open_aedat2, open_aedat3
+from streamfeat.camera_files.aedat4 import open_aedat4
+from streamfeat.camera_files.arrays import open_numpy
+from streamfeat.camera_files.containers import open_hdf5
 from streamfeat.camera_files.prophesee import (
-    declared_resolution,
-    percent_header,
-    read_bin40,
-    read_dat,
-    read_evt2,
-    read_evt3,
-    start_of_dat,
+    encoding_of_header,
+    open_bin40,
+    open_dat,
+    open_evt2,
+    open_evt3,
 )
-from streamfeat.camera_files.tables import HEAD_BYTES, read_numpy, read_text, text_resolution
+from streamfeat.camera_files.source import HEAD_BYTES, Contents, TableOptions
+from streamfeat.camera_files.text import open_text
+from streamfeat.camera_files.vectors import open_evt4, open_evt21
 from streamfeat.errors import InputError, printable
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
 
-__all__ = ["EXTENSIONS", "FORMATS", "EventFile", "ForeignFile", "open_events", "read_events"]
+__all__ = [
+    "AS_THE_FILE_SAYS",
+    "EXTENSIONS",
+    "FORMATS",
+    "EventFile",
+    "ForeignFile",
+    "open_events",
+    "read_events",
+]
 
 FORMATS = {
     "dat": "Prophesee .dat (CD events, version 2)",
     "bin40": "40-bit .bin (N-MNIST, N-Caltech101)",
     "evt2": "Prophesee EVT 2.0 .raw",
+    "evt21": "Prophesee EVT 2.1 .raw",
     "evt3": "Prophesee EVT 3.0 .raw",
+    "evt4": "Prophesee EVT 4.0 .raw",
+    "aedat2": "AEDAT 2.0 .aedat",
+    "aedat3": "AEDAT 3.1 .aedat",
     "aedat4": "AEDAT 4 .aedat4",
-    "hdf5": "Prophesee HDF5 .h5/.hdf5 (CD/events)",
+    "hdf5": "HDF5 .h5/.hdf5 (Prophesee, DSEC, M3ED, MVSEC, e2vid, v2e)",
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
     "text": "text .txt/.csv (t x y p)",
 }
 """What can be read, by the name that `open_events` takes."""
 
-EXTENSIONS = frozenset([".dat", ".bin", ".raw", ".aedat4", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"])
+EXTENSIONS = frozenset(
+    [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
+)
 """Endings, lower case, of files in which events are looked for."""
+
+AS_THE_FILE_SAYS = TableOptions()
+"""No options."""
+
+_Open = Callable[[Path, bytes, TableOptions], Contents]
 
 
 class EventFile:
-    """A foreign file, opened but not read. Iterating yields `(n,)` batches of `EVENT_DTYPE`, in stored order.
+    """A camera file, opened but not read. Iterating yields `(n,)` batches of `EVENT_DTYPE`, in stored order.
 
     Each iteration reads the file anew, a bounded block at a time (`.npy` and `.npz` whole).
-    Events outside a `resolution` that the file declares are left out and counted as damage.
+    Events outside a resolution that the file or an option declares are left out and counted.
     """
 
-    def __init__(self, path: Path, format: str, resolution: Resolution | None, start: int) -> None:
-        """Describe the file; `open_events` finds out the arguments.
-
-        Args:
-            path: the file.
-            format: a key of `FORMATS`.
-            resolution: `(height, width)` in pixels, None where the file does not say.
-            start: byte at which the events begin.
-        """
-        self.path, self.format, self.resolution, self.start = path, format, resolution, start
+    def __init__(self, path: Path, format: str, contents: Contents, options: TableOptions) -> None:
+        """Describe the file; `open_events` finds out the arguments."""
+        self.path, self.format = path, format
+        self.declared: Resolution | None = options.resolution or contents.resolution
+        """`(height, width)` in pixels by option or by the file, None where neither says."""
+        self.start = contents.start
+        """Byte at which the events begin."""
+        self.streams = contents.streams
+        """Names of the event streams, where the format can hold several."""
+        self.labels = contents.labels
+        """Labels that the file holds besides its events."""
         self.lost_bytes = 0
         """Bytes that the last iteration could not use, where that can be counted."""
+        self.skipped = 0
+        """Events that the last iteration left out: those outside the declared resolution."""
         self.damage: list[str] = []
         """What the last iteration left out, a line for each reason; empty for a whole file."""
+        self._contents = contents
+        self._guessed: Resolution | None = None
+
+    @property
+    def resolution(self) -> Resolution:
+        """`(height, width)`: `declared`, else the smallest that holds all events, for which the file is read
+        once from beginning to end.
+        """
+        if self.declared:
+            return self.declared
+        if self._guessed is None:
+            height = width = 1
+            for batch in self._contents.read(_Unheard()):
+                if len(batch):
+                    height = max(height, int(batch["y"].max()) + 1)
+                    width = max(width, int(batch["x"].max()) + 1)
+            self._guessed = height, width
+        return self._guessed
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        """One line for each thing that the file does not say and that was decided; may read the file once, as
+        `resolution` does.
+        """
+        if self.declared:
+            return self._contents.assumptions
+        height, width = self.resolution
+        return (
+            *self._contents.assumptions,
+            f"the file does not say its resolution: {width}x{height} is the smallest that holds all events; "
+            "--resolution WxH sets it",
+        )
 
     def __iter__(self) -> Iterator[Events]:
         """Read all batches.
@@ -72,21 +128,25 @@ class EventFile:
         Raises:
             InputError: nothing more can be read, and the format does not allow to keep what came before.
         """
-        self.lost_bytes, self.damage = 0, []
-        outside = 0
+        return self.blocks()
+
+    def blocks(self) -> Iterator[Events]:
+        """Read all batches; see `__iter__`."""
+        self.lost_bytes, self.skipped, self.damage = 0, 0, []
         try:
-            for batch in _READERS[self.format](self):
-                if self.resolution is not None:
-                    height, width = self.resolution
+            for batch in self._contents.read(self):
+                if self.declared is not None:
+                    height, width = self.declared
                     inside = (batch["x"] < width) & (batch["y"] < height)
                     if not inside.all():
-                        outside += int((~inside).sum())
+                        self.skipped += int((~inside).sum())
                         batch = batch[inside]
                 yield batch
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error}") from error
-        if outside and self.resolution is not None:
-            self.damage.append(f"{outside} events outside {self.resolution[1]}x{self.resolution[0]} left out")
+        if self.skipped and self.declared is not None:
+            height, width = self.declared
+            self.damage.append(f"{self.skipped} events outside {width}x{height} left out")
 
     def lose(self, n_bytes: int, why: str) -> None:
         """Note a loss while reading."""
@@ -94,12 +154,16 @@ class EventFile:
         self.damage.append(printable(why))
 
 
+class _Unheard:
+    """Losses that are counted when the events are read."""
+
+    def lose(self, n_bytes: int, why: str) -> None:
+        """Nothing: see `EventFile.lose`."""
+
+
 @dataclass(frozen=True, slots=True)
 class ForeignFile:
-    """All of one file: `events` `(n,)` of `EVENT_DTYPE`; the rest as in `EventFile`.
-
-    Where the file does not say its resolution, `resolution` is the smallest that holds all events.
-    """
+    """All of one file: `events` `(n,)` of `EVENT_DTYPE`; the rest as in `EventFile`."""
 
     events: Events
     resolution: Resolution
@@ -108,15 +172,19 @@ class ForeignFile:
     damage: tuple[str, ...]
 
 
-def open_events(path: str | Path, format: str | None = None) -> EventFile:
-    """Open a foreign event file; its events are read when it is iterated.
+def open_events(
+    path: str | Path, format: str | None = None, *, options: TableOptions = AS_THE_FILE_SAYS
+) -> EventFile:
+    """Open a camera file; its events are read when it is iterated.
 
     Args:
         path: the file.
         format: a key of `FORMATS`; None finds it from the content, then from the ending.
+        options: what the file does not say, or says wrongly.
 
     Raises:
-        InputError: no such file, an unknown format, or a header that does not fit it.
+        InputError: no such file, an unknown format, a header that does not fit it, or several event streams
+            and none chosen.
     """
     path = Path(path)
     try:
@@ -130,58 +198,43 @@ def open_events(path: str | Path, format: str | None = None) -> EventFile:
         format = _find_format(path, head)
     elif format not in FORMATS:
         raise InputError(f"unknown format {format!r}; known are {', '.join(FORMATS)}")
-    resolution, start = None, 0
-    if format in ("dat", "evt2", "evt3"):
-        fields, start = percent_header(path, head)
-        resolution = declared_resolution(path, fields)
-        if format == "dat":
-            start = start_of_dat(path, fields, head, start)
-        elif fields.get("endianness", "little") != "little":
-            raise InputError(f"{path}: header says {fields['endianness']} endian; only little endian is read")
-    elif format == "text":
-        resolution = text_resolution(path, head)
-    elif format == "aedat4":
-        resolution = aedat4_resolution(path)
-    elif format == "hdf5":
-        resolution = hdf5_resolution(path)
-    return EventFile(path, format, resolution, start)
+    return EventFile(path, format, _OPENERS[format](path, head, options), options)
 
 
-def read_events(path: str | Path, format: str | None = None) -> ForeignFile:
-    """Read all events of one foreign file into memory; for large files iterate `open_events`.
+def read_events(
+    path: str | Path, format: str | None = None, *, options: TableOptions = AS_THE_FILE_SAYS
+) -> ForeignFile:
+    """Read all events of one camera file into memory; for large files iterate `open_events`.
 
     Args:
         path: the file.
         format: see `open_events`.
+        options: see `open_events`.
 
     Raises:
         InputError: see `open_events` and `EventFile.__iter__`.
     """
-    file = open_events(path, format)
+    file = open_events(path, format, options=options)
     events = np.concatenate([np.empty(0, EVENT_DTYPE), *file])
-    resolution = file.resolution or (int(events["y"].max(initial=0)) + 1, int(events["x"].max(initial=0)) + 1)
+    resolution = file.declared or (int(events["y"].max(initial=0)) + 1, int(events["x"].max(initial=0)) + 1)
     return ForeignFile(events, resolution, file.format, file.lost_bytes, tuple(file.damage))
 
 
 def _find_format(path: Path, head: bytes) -> str:
     ending = path.suffix.lower()
-    if ending in (".txt", ".csv"):
-        return "text"
-    for magic, name in ((b"#!AER-DAT4", "aedat4"), (b"\x89HDF\r\n\x1a\n", "hdf5")):
+    for magic, name in _MAGIC.items():
         if head.startswith(magic):
             return name
-    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")) and ending in (".npy", ".npz"):
-        return "numpy"
     if head.startswith(b"\x89MCAP0\r\n"):
         raise InputError(f"{path}: is an MCAP recording already; no conversion is needed")
+    if ending in (".txt", ".csv"):
+        return "text"
+    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")) and ending in (".npy", ".npz"):
+        return "numpy"
     if head.startswith(b"%"):
-        fields, _ = percent_header(path, head)
-        version = fields.get("format", "").split(";")[0] or "EVT" + fields.get("evt", "")
-        known = {"EVT2": "evt2", "EVT2.0": "evt2", "EVT3": "evt3", "EVT3.0": "evt3"}
-        if version.upper() in known:
-            return known[version.upper()]
-        if version != "EVT":
-            raise InputError(f"{path}: events are encoded as {version}; of these, EVT2 and EVT3 are read")
+        encoding = encoding_of_header(path, head)
+        if encoding:
+            return encoding
         if ending == ".dat":
             return "dat"
     if ending == ".bin":
@@ -189,13 +242,24 @@ def _find_format(path: Path, head: bytes) -> str:
     raise InputError(f"{path}: not a known event file; known are {'; '.join(FORMATS.values())}")
 
 
-_READERS: dict[str, Callable[[EventFile], Iterator[Events]]] = {
-    "dat": read_dat,
-    "bin40": read_bin40,
-    "evt2": read_evt2,
-    "evt3": read_evt3,
-    "aedat4": read_aedat4,
-    "hdf5": read_hdf5,
-    "numpy": read_numpy,
-    "text": read_text,
+_MAGIC = {
+    b"#!AER-DAT2": "aedat2",
+    b"#!AER-DAT3": "aedat3",
+    b"#!AER-DAT4": "aedat4",
+    b"\x89HDF\r\n\x1a\n": "hdf5",
+}
+
+_OPENERS: dict[str, _Open] = {
+    "dat": open_dat,
+    "bin40": open_bin40,
+    "evt2": open_evt2,
+    "evt21": open_evt21,
+    "evt3": open_evt3,
+    "evt4": open_evt4,
+    "aedat2": open_aedat2,
+    "aedat3": open_aedat3,
+    "aedat4": open_aedat4,
+    "hdf5": open_hdf5,
+    "numpy": open_numpy,
+    "text": open_text,
 }

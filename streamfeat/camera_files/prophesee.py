@@ -1,11 +1,11 @@
 """The words that sensors write: `.dat`, 40-bit `.bin`, EVT 2.0 and EVT 3.0, in files of their own.
 
 Lives here: headers of `% key value` lines, and fixed-size records to events, a bounded block at a time.
-Not here: which format a file has (`event_files`), and packets (`streamfeat.messages`).
+Not here: EVT 2.1 and 4.0 (`vectors`), which format a file has (`event_files`), and packets
+(`streamfeat.messages`).
 
 Records of fixed size are a few lines of NumPy: 13 to 27 million events a second on two shared cores, where
-packets are written at 2 to 5, so a library would buy nothing. (EVT2: faery 15, eventcv 20, expelliarmus 49;
-N-CARS `.dat`: expelliarmus 67, the other two refuse its header.) EVT3 uses the decoder of packets, reading
+packets are written at 2 to 5, so a library would buy nothing. EVT3 uses the decoder of packets, reading
 t = TIME_HIGH << 12 | TIME_LOW as published. On recorded words where TIME_LOW steps back, expelliarmus 1.1.12
 adds 4096 us at each step, beyond what the TIME_HIGH words allow, and faery 0.7.1 holds the time until it is
 reached again. `tools/compare_decoders.py` prints all of this.
@@ -13,40 +13,52 @@ reached again. `tools/compare_decoders.py` prints all of this.
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from streamfeat.camera_files.source import BLOCK_BYTES, Contents, Losses, TableOptions, checked_resolution
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
 from streamfeat.messages.codecs import make_decoder
 
 __all__ = [
-    "BLOCK_BYTES",
-    "Source",
-    "checked_resolution",
+    "HighTimes",
+    "Unwrapped",
+    "blocks_of",
     "declared_resolution",
+    "encoding_of_header",
+    "header_contents",
+    "open_bin40",
+    "open_dat",
+    "open_evt2",
+    "open_evt3",
     "percent_header",
-    "read_bin40",
-    "read_dat",
-    "read_evt2",
-    "read_evt3",
-    "start_of_dat",
+    "resolution_of_sensor",
 ]
 
-BLOCK_BYTES = 1_000_000  # a multiple of every record size: 2, 4, 5 and 8
-_SENSORS = {"genx320": (320, 320), "gen3": (480, 640), "gen4": (720, 1280), "imx636": (720, 1280)}
-
-
-class Source(Protocol):
-    """What a reader needs to know of a file: where its events begin, and whom to tell of a loss."""
-
-    path: Path
-    start: int
-
-    def lose(self, n_bytes: int, why: str) -> None:
-        """Note that `n_bytes` could not be used, with one line that says why."""
+_ENCODINGS = {
+    "EVT2": "evt2",
+    "EVT2.0": "evt2",
+    "EVT2.1": "evt21",
+    "EVT21": "evt21",
+    "EVT3": "evt3",
+    "EVT3.0": "evt3",
+    "EVT4": "evt4",
+    "EVT4.0": "evt4",
+}
+_SENSORS = {
+    "genx320": (320, 320),
+    "gen3": (480, 640),
+    "gen4": (720, 1280),
+    "imx636": (720, 1280),
+    "imx646": (720, 1280),
+}
+_GENERATIONS = {"320": (320, 320), "3": (480, 640), "4": (720, 1280)}
 
 
 def percent_header(path: Path, head: bytes) -> tuple[dict[str, str], int]:
@@ -67,54 +79,131 @@ def percent_header(path: Path, head: bytes) -> tuple[dict[str, str], int]:
     return fields, start
 
 
+def encoding_of_header(path: Path, head: bytes) -> str:
+    """`evt2`, `evt21`, `evt3` or `evt4` as a header says, "" where it says nothing.
+
+    Raises:
+        InputError: it names another encoding.
+    """
+    fields, _ = percent_header(path, head)
+    version = fields.get("format", "").split(";")[0] or "EVT" + fields.get("evt", "")
+    if version == "EVT":
+        return ""
+    if version.upper() not in _ENCODINGS:
+        raise InputError(f"{path}: events are encoded as {version:.40}; EVT2, EVT2.1, EVT3 and EVT4 are read")
+    return _ENCODINGS[version.upper()]
+
+
 def declared_resolution(path: Path, fields: Mapping[str, str]) -> Resolution | None:
-    """`(height, width)` of a header, else of the sensor generation it names, else None."""
+    """`(height, width)` of a header, None where it gives none."""
     described = f"{fields.get('geometry', '')};{fields.get('format', '')}".lower()
     width, height = fields.get("width", ""), fields.get("height", "")
     if match := re.search(r"(?<!\d)(\d+)x(\d+)", described):
         width, height = match.groups()
     elif "width=" in described and "height=" in described:
         width, height = (described.partition(f"{k}=")[2].partition(";")[0] for k in ("width", "height"))
-    if width or height:
-        return checked_resolution(path, height, width)
-    plugin = fields.get("plugin_name", "")
-    return next((resolution for name, resolution in _SENSORS.items() if name in plugin), None)
+    return checked_resolution(path, height, width) if width or height else None
 
 
-def checked_resolution(path: Path, height: object, width: object) -> Resolution:
-    """Make a `(height, width)` of what a header says; InputError where a side is not 1 to 32767."""
-    if all(re.fullmatch(r"\d{1,5}", str(side)) and 0 < int(str(side)) <= 0x7FFF for side in (height, width)):
-        return int(str(height)), int(str(width))
-    raise InputError(
-        f"{path}: header declares {width!s:.20} x {height!s:.20} pixels; mend the header or drop it"
-    )
+def resolution_of_sensor(fields: Mapping[str, str]) -> tuple[Resolution, str] | None:
+    """`(height, width)` of the sensor that a header names, and the field that names it."""
+    for key in ("sensor_name", "plugin_name"):
+        for name, resolution in _SENSORS.items():
+            if name in fields.get(key, "").lower():
+                return resolution, f"{key} {fields[key]:.40}"
+    generation = fields.get("generation", "").partition(".")[0]
+    if generation in _GENERATIONS:
+        return _GENERATIONS[generation], f"generation {fields['generation']:.40}"
+    return None
 
 
-def start_of_dat(path: Path, fields: Mapping[str, str], head: bytes, start: int) -> int:
-    """Check the two bytes after a `.dat` header: event type and size."""
-    kind = head[start : start + 2]
+def header_contents(path: Path, head: bytes) -> tuple[dict[str, str], Contents]:
+    """Fields of a header, and what they say of the file; its reader is still to be set."""
+    fields, start = percent_header(path, head)
+    resolution = declared_resolution(path, fields)
+    assumptions: tuple[str, ...] = ()
+    if resolution is None and (sensor := resolution_of_sensor(fields)):
+        resolution, named = sensor
+        assumptions = (f"resolution {resolution[1]}x{resolution[0]} is that of the sensor in '{named}'",)
+    return fields, Contents(_nothing, resolution, start, assumptions=assumptions)
+
+
+def _nothing(losses: Losses) -> Iterator[Events]:
+    return iter(())
+
+
+def open_dat(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """`.dat`: after the header two bytes, event type and size."""
+    fields, contents = header_contents(path, head)
+    start = contents.start + 2
+    kind = head[contents.start : start]
     if len(kind) < 2 or kind[0] not in (0x00, 0x0C) or kind[1] != 8 or fields.get("version", "2") != "2":
         raise InputError(
-            f"{path}: byte {start}: event type and size {kind.hex(' ') or 'missing'}, version "
+            f"{path}: byte {contents.start}: event type and size {kind.hex(' ') or 'missing'}, version "
             f"{fields.get('version', '2')}; only CD events (00 or 0c) of 8 bytes, version 2, are read"
         )
-    return start + 2
+    return replace(contents, start=start, read=partial(_read_dat, path, start))
 
 
-def read_dat(file: Source) -> Iterator[Events]:
-    """u32 microseconds, then u32: x in bits 0-13, y in bits 14-27, polarity above."""
-    for block in _blocks(file, 8):
+def open_bin40(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """40-bit `.bin`, which has no header."""
+    return Contents(partial(_read_bin40, path))
+
+
+def open_evt2(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """EVT 2.0."""
+    contents = _little_endian(path, head)
+    return replace(contents, read=partial(_read_evt2, path, contents.start))
+
+
+def open_evt3(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """EVT 3.0."""
+    contents = _little_endian(path, head)
+    return replace(contents, read=partial(_read_evt3, path, contents.start))
+
+
+def _little_endian(path: Path, head: bytes) -> Contents:
+    fields, contents = header_contents(path, head)
+    if (order := fields.get("endianness", "little")) != "little":
+        raise InputError(f"{path}: header says {order:.20} endian; only little endian is read")
+    return contents
+
+
+class Unwrapped:
+    """Times of a counter that starts anew at `1 << bits`: only a fall of more than half of that is a wrap."""
+
+    def __init__(self, bits: int) -> None:
+        """Start with no wrap."""
+        self._range, self._wraps, self._last = 1 << bits, 0, -1
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Go on with `(n,)` int64 counts."""
+        if not len(times):
+            return times
+        steps = np.diff(times, prepend=times[0] if self._last < 0 else self._last)
+        half = self._range // 2
+        wraps = self._wraps + np.cumsum((steps < -half).astype(np.int64) - (steps > half))
+        # An event from before the wrap may still come after it, but there is nothing before the first.
+        np.maximum(wraps, 0, out=wraps)
+        self._wraps, self._last = int(wraps[-1]), int(times[-1])
+        return times + wraps * self._range
+
+
+def _read_dat(path: Path, start: int, losses: Losses) -> Iterator[Events]:
+    """u32 microseconds that wrap, then u32: x in bits 0-13, y in bits 14-27, polarity above."""
+    unwrapped = Unwrapped(32)
+    for block in blocks_of(path, start, 8, losses):
         t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T
-        yield make_events(word & 0x3FFF, word >> 14 & 0x3FFF, word >> 28 != 0, t)
+        yield make_events(word & 0x3FFF, word >> 14 & 0x3FFF, word >> 28 != 0, unwrapped(t.astype(np.int64)))
 
 
-def read_bin40(file: Source) -> Iterator[Events]:
+def _read_bin40(path: Path, losses: Losses) -> Iterator[Events]:
     """Bytes x and y, then polarity (1 bit) and microseconds (23 bits), big-endian; Orchard et al. (2015).
 
     A record with y = 240 is no event (the ATIS has rows 0 to 239): it adds 2^13 us to all times after it.
     """
     overflow, previous, steps, backsteps = 0, 0, 0, 0
-    for block in _blocks(file, 5):
+    for block in blocks_of(path, 0, 5, losses):
         x, y, high, middle, low = np.frombuffer(block, "u1").reshape(-1, 5).T
         t = (high & 0x7F).astype(np.int64) << 16 | middle.astype(np.int64) << 8 | low
         is_marker = y == 240
@@ -126,48 +215,70 @@ def read_bin40(file: Source) -> Iterator[Events]:
         backsteps += int((np.diff(events["t"], prepend=previous) < 0).sum())
         if backsteps > 1 + steps // 8:
             raise InputError(
-                f"{file.path}: time goes back {backsteps} times in the first {steps} events; "
+                f"{path}: time goes back {backsteps} times in the first {steps} events; "
                 "this is no 40-bit event file, or it is damaged"
             )
         previous = int(events["t"][-1]) if len(events) else previous
         yield events
 
 
-def read_evt2(file: Source) -> Iterator[Events]:
+def _read_evt2(path: Path, start: int, losses: Losses) -> Iterator[Events]:
     """u32 words (Prophesee EVT 2.0): type in bits 28-31; CD words hold 6 bits of time, x (11), y (11).
 
     TIME_HIGH holds 28 bits of time above those 6; its wraps are counted. Events before the first are skipped.
     """
-    high, seen = 0, False
-    for block in _blocks(file, 4):
+    times = HighTimes()
+    for block in blocks_of(path, start, 4, losses):
         words = np.frombuffer(block, "<u4")
         kind = words >> 28
-        is_high = kind == 8
-        steps = np.diff((words[is_high] & 0xFFFFFFF).astype(np.int64), prepend=high & 0xFFFFFFF)
-        steps[steps < -(1 << 27)] += 1 << 28
-        highs = high + np.concatenate([[0], np.cumsum(steps)])
-        latest = np.cumsum(is_high)
-        high = int(highs[-1])
-        keep = (kind <= 1) & (seen | (latest > 0))
-        seen = seen or bool(is_high.any())
+        keep = kind <= 1
+        high, known = times(kind == 8, words)
+        keep &= known
         word = words[keep]
-        t = highs[latest[keep]] << 6 | (word >> 22 & 0x3F)
+        t = high[keep] << 6 | (word >> 22 & 0x3F)
         yield make_events(word >> 11 & 0x7FF, word & 0x7FF, word >> 28, t)
 
 
-def read_evt3(file: Source) -> Iterator[Events]:
+class HighTimes:
+    """TIME_HIGH of 28 bits, which holds for the words after it; its wraps are counted."""
+
+    def __init__(self) -> None:
+        """Start with no TIME_HIGH seen."""
+        self._unwrapped, self._high, self._seen = Unwrapped(28), 0, False
+
+    def __call__(
+        self, is_high: NDArray[np.bool_], values: NDArray[Any]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Go on with `(n,)` words.
+
+        Args:
+            is_high: which of them are TIME_HIGH.
+            values: their low 28 bits are the time.
+
+        Returns:
+            For each word the TIME_HIGH that holds, and whether there has been one.
+        """
+        highs = self._unwrapped((values[is_high] & 0xFFFFFFF).astype(np.int64))
+        latest = np.cumsum(is_high)
+        high = np.concatenate([[self._high], highs])[latest]
+        known = self._seen | (latest > 0)
+        self._high, self._seen = int(high[-1]) if len(high) else self._high, self._seen or bool(len(highs))
+        return high, known
+
+
+def _read_evt3(path: Path, start: int, losses: Losses) -> Iterator[Events]:
     """u16 words (Prophesee EVT 3.0), read as one long packet."""
     decoder = make_decoder("evt3")
-    for block in _blocks(file, 2):
+    for block in blocks_of(path, start, 2, losses):
         yield decoder.decode(block, 0)
 
 
-def _blocks(file: Source, record: int) -> Iterator[bytes]:
+def blocks_of(path: Path, start: int, record: int, losses: Losses) -> Iterator[bytes]:
     """Whole records in blocks; a partial record at the end is counted as lost."""
-    with file.path.open("rb") as raw:
-        raw.seek(file.start)
+    with path.open("rb") as raw:
+        raw.seek(start)
         while block := raw.read(BLOCK_BYTES):
-            if partial := len(block) % record:
-                file.lose(partial, f"{partial} bytes at byte {raw.tell() - partial} are not a whole record")
-                block = block[:-partial]
+            if rest := len(block) % record:
+                losses.lose(rest, f"{rest} bytes at byte {raw.tell() - rest} are not a whole record")
+                block = block[:-rest]
             yield block

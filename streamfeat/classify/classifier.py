@@ -15,9 +15,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from streamfeat.classify.folds import assign_folds, check_labels
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
+from streamfeat.report.shown import Shown
 
 __all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
 
@@ -54,8 +56,8 @@ def _roots(features: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     return np.copysign(size, features, out=size), np.where(length > 0, length, np.float32(1))
 
 
-@dataclass(frozen=True, slots=True)
-class Classifier:
+@dataclass(frozen=True, slots=True, repr=False)
+class Classifier(Shown):
     """A frozen linear classifier over the features of one encoder.
 
     Attributes:
@@ -83,6 +85,11 @@ class Classifier:
         folded = self.weights / self.scale[:, np.newaxis]
         object.__setattr__(self, "_folded", folded)
         object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
+
+    @property
+    def linear(self) -> "Classifier":
+        """Itself: what can learn online and keep pace with single events."""
+        return self
 
     @classmethod
     def untrained(cls, labels: Sequence[str], encoder: FeatureMap) -> Self:
@@ -137,13 +144,17 @@ class Classifier:
 
     def save(self, path: str | Path) -> None:
         """Write one safetensors file; the file appears whole or not at all."""
+        write_safetensors(Path(path), _KIND, FORMAT_VERSION, *self.parts())
+
+    def parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """The arrays and the header of its file."""
         arrays = {name: getattr(self, name) for name in ("centre", "scale", "weights", "bias")}
         header = {
             "labels": list(self.labels),
             "fingerprint": self.fingerprint,
             "provenance": dict(self.provenance),
         }
-        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
+        return arrays, header
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -152,7 +163,13 @@ class Classifier:
         Raises:
             InputError: the file is missing, cut short, of another version, or not a classifier.
         """
-        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        return cls.from_parts(path, *read_safetensors(Path(path), _KIND, FORMAT_VERSION))
+
+    @classmethod
+    def from_parts(
+        cls, path: str | Path, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+    ) -> Self:
+        """Check what a file holds, as `load` does."""
         fingerprint, provenance = header.get("fingerprint"), header.get("provenance", {})
         labels = header["labels"] if isinstance(header.get("labels"), list) else []
         sound = all(isinstance(name, str) for name in labels) and len(set(labels)) == len(labels) >= 2
@@ -188,62 +205,48 @@ def train_classifier(
     labels: Sequence[str],
     encoder: FeatureMap,
     *,
-    groups: ArrayLike | None = None,
+    parts: NDArray[np.int64] | None = None,
     candidates: Sequence[float] | None = None,
     folds: int = 3,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,
 ) -> Classifier:
-    """Train a linear SVM; its regularisation is chosen by stratified cross-validation.
+    """Train a linear SVM; its regularisation is chosen by cross-validation.
 
     Args:
         features: `(n, F)` float32, as `Encoder.encode` gives them; not changed.
         labels: `n` names.
         encoder: that made the features.
-        groups: `n` integers; samples of one group are never on two sides of a fold, as those that were made
-            from one another. Every sample is a group if not given.
+        parts: `(n,)` the fold in which each row is scored, from `folds.assign_folds`: those made from one
+            sample have the same. Samples are shuffled into stratified folds if not given.
         candidates: values of C to choose from; the scale is that of standardised features. If not given,
             powers of ten, as many as it takes for the best to have neighbours on both sides.
-        folds: of the cross-validation.
-        seed: of the folds.
+        folds: how many, where `parts` is not given.
+        seed: of the shuffling.
         provenance: JSON values kept with the classifier; scores are added.
 
     Raises:
         InputError: labels are missing, fewer than two classes, or a class with fewer samples than folds.
     """
-    from sklearn.model_selection import StratifiedGroupKFold
     from sklearn.preprocessing import StandardScaler
 
     from streamfeat.classify.svm import LinearSVM
 
-    missing = [i for i, label in enumerate(labels) if not (isinstance(label, str) and label)]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(labels)} training samples have no label, the first is sample "
-            f"{missing[0]}; label them or leave them out"
-        )
+    check_labels(labels)
     targets = np.asarray(labels)
-    group = np.arange(len(targets)) if groups is None else np.asarray(groups)
-    names, counts = np.unique(targets[np.unique(group, return_index=True)[1]], return_counts=True)
-    if len(names) < 2:
-        raise InputError(f"the training samples hold {len(names)} label(s); at least two are needed")
-    if folds < 2:
-        raise InputError(f"cross-validation with {folds} folds is not possible; it needs at least two")
-    if counts.min() < folds:
-        raise InputError(
-            f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
-            f"{folds}-fold cross-validation needs {folds}; add samples or lower the folds"
-        )
+    if (n_names := len(set(labels))) < 2:
+        raise InputError(f"the training samples hold {n_names} label(s); at least two are needed")
+    if parts is None:
+        parts = assign_folds(labels, [""] * len(labels), folds, "none", seed)
     rows = normalise_features(features)
-    splitter = StratifiedGroupKFold(folds, shuffle=True, random_state=seed)
-    parts = [
-        (train, test, StandardScaler().fit(rows[train]), LinearSVM(warm_start=True))
-        for train, test in splitter.split(rows, targets, group)
+    sides = [(parts != part, parts == part) for part in np.unique(parts)]
+    fitted = [
+        (train, test, StandardScaler().fit(rows[train]), LinearSVM(warm_start=True)) for train, test in sides
     ]
 
     def score(c: float) -> float:
         right = 0
-        for train, test, fold_scaler, svm in parts:
+        for train, test, fold_scaler, svm in fitted:
             svm.set_params(C=c).fit(fold_scaler.transform(rows[train]), targets[train])
             right += int(np.sum(svm.predict(fold_scaler.transform(rows[test])) == targets[test]))
         return right / len(targets)

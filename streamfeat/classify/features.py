@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Losses, Recording, Sample
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
@@ -30,6 +31,10 @@ __all__ = [
     "sample_end",
     "training_set",
 ]
+
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def sample_end(label: Label) -> int:
@@ -50,20 +55,23 @@ def encode_samples(
     Yields:
         label and `(n_features,)` float32, in order.
     """
-    n = threads or os.cpu_count() or 1
 
     def encode(sample: Sample) -> tuple[Label, NDArray[np.float32]]:
         origin, end = sample.label.start_us, sample_end(sample.label)
         return sample.label, encoder.encode(sample.events, sample.resolution, origin_us=origin, t_us=end)
 
-    source = iter(samples)
+    yield from _mapped(encode, samples, threads)
+
+
+def _mapped(function: Callable[[T], R], values: Iterable[T], threads: int | None) -> Iterator[R]:
+    """Call a function for each value on several threads, a few ahead of what has been yielded; in order."""
+    n = threads or os.cpu_count() or 1
+    source = iter(values)
     with ThreadPoolExecutor(n, thread_name_prefix="encode") as pool:
-        ahead: deque[Future[tuple[Label, NDArray[np.float32]]]] = deque(
-            pool.submit(encode, sample) for sample in islice(source, 2 * n)
-        )
+        ahead: deque[Future[R]] = deque(pool.submit(function, value) for value in islice(source, 2 * n))
         while ahead:
             yield ahead.popleft().result()
-            ahead.extend(pool.submit(encode, sample) for sample in islice(source, 1))
+            ahead.extend(pool.submit(function, value) for value in islice(source, 1))
 
 
 def mirrored(sample: Sample) -> Sample:
@@ -83,11 +91,13 @@ class EncodedSamples:
     Attributes:
         rows: `(n, F)` float32.
         labels: `(n,)` names.
+        sources: `(n,)` texts, what the labels say that samples are from.
         held_out: `(n,)` bool, whether a sample is of a held-out split.
     """
 
     rows: NDArray[np.float32]
     labels: NDArray[np.str_]
+    sources: NDArray[np.str_]
     held_out: NDArray[np.bool_]
 
 
@@ -123,6 +133,7 @@ def encode_recordings(
     return EncodedSamples(
         np.concatenate(rows) if rows else np.empty((0, encoder.n_features), np.float32),
         np.array([label.label for label in labels], str),
+        np.array([label.source for label in labels], str),
         np.array([label.split in HELD_OUT_SPLITS for label in labels], bool),
     )
 
@@ -159,33 +170,67 @@ def training_set(
 
 
 class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Turn labelled samples into features, as a step of a scikit-learn `Pipeline`.
+    """Turn samples of events into features, as a step of a scikit-learn `Pipeline`.
 
     Stateless: the encoder is learned beforehand, without labels. `set_output(transform="pandas")` makes its
     output a data frame, as everywhere in scikit-learn.
 
+    Example:
+        >>> EventFeatures(encoder, resolution=(34, 34)).transform([events, more_events]).shape
+        (2, 3200)
+
     Args:
         encoder: the frozen encoder.
         threads: how many encode at once; as many as there are cores if not given.
+        resolution: `(height, width)` of the sensor, for event arrays that come without one.
     """
 
-    def __init__(self, encoder: Encoder, threads: int | None = None) -> None:
+    def __init__(
+        self, encoder: Encoder, threads: int | None = None, resolution: Resolution | None = None
+    ) -> None:
         """Keep the parameters."""
         self.encoder = encoder
         self.threads = threads
+        self.resolution = resolution
 
     def fit(self, X: Any, y: Any = None) -> Self:
         """Do nothing; the encoder is frozen."""
         return self
 
-    def transform(self, X: Iterable[Sample]) -> NDArray[np.float32]:
-        """Features `(n, n_features)` float32 of `n` samples, such as `list(recording.samples())`.
+    def transform(self, X: Iterable[Sample | Events | tuple[Events, Resolution]]) -> NDArray[np.float32]:
+        """Features of `n` samples: `(n, n_features)` float32.
+
+        Args:
+            X: labelled samples, such as `list(recording.samples())`, whose features are those at the end of
+                the label; or event arrays, `(m,)` EVENT_DTYPE or of another tool (see `as_events`), whose
+                window begins with the first and ends with the last event; or pairs of such an array and its
+                `(height, width)`.
 
         Raises:
-            InputError: one of them is not a sample.
+            InputError: one of them is none of these, or an array has no resolution.
         """
-        rows = [features for _, features in encode_samples(self.encoder, _checked(X), threads=self.threads)]
+        rows = list(_mapped(self._encode, enumerate(X), self.threads))
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)
+
+    def _encode(self, numbered: tuple[int, Any]) -> NDArray[np.float32]:
+        number, sample = numbered
+        if isinstance(sample, Sample):
+            origin_us, end_us = sample.label.start_us, sample_end(sample.label)
+            return self.encoder.encode(sample.events, sample.resolution, origin_us=origin_us, t_us=end_us)
+        resolution = self.resolution
+        if isinstance(sample, tuple) and len(sample) == 2:
+            sample, resolution = sample
+        if not isinstance(sample, np.ndarray) or sample.dtype.names is None:
+            raise InputError(
+                f"sample {number} is of type {type(sample).__name__}; give labelled samples, such as "
+                "list(recording.samples()), or structured arrays of events"
+            )
+        if resolution is None:
+            raise InputError(
+                f"sample {number} is an array of events without a resolution; give "
+                "EventFeatures(encoder, resolution=(height, width)), or pairs of events and resolution"
+            )
+        return self.encoder.encode(sample, resolution)
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
         """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
@@ -209,13 +254,3 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     def __sklearn_is_fitted__(self) -> bool:
         """Say that there is nothing to fit."""
         return True
-
-
-def _checked(samples: Iterable[Any]) -> Iterator[Sample]:
-    for i, sample in enumerate(samples):
-        if not isinstance(sample, Sample):
-            raise InputError(
-                f"sample {i} is of type {type(sample).__name__}; "
-                "give labelled samples, such as list(recording.samples())"
-            )
-        yield sample

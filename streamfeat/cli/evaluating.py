@@ -68,7 +68,10 @@ def evaluate(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
+    start: options.Start = None,
+    rows: options.Rows = None,
     conditioning: options.Conditioning = None,
     coherence: options.Coherence = None,
     log_det: options.LogDet = None,
@@ -76,6 +79,7 @@ def evaluate(
     iterations: options.Iterations = None,
     seed: options.Seed = None,
     mirror: options.Mirror = False,
+    kernel: options.Kernel = "linear",
     on: Annotated[
         str,
         typer.Option(
@@ -84,6 +88,7 @@ def evaluate(
         ),
     ] = "held-out",
     folds: Annotated[int, typer.Option(help="Folds, where no held-out split is scored.")] = 5,
+    groups: options.Groups = "block",
     early_samples: Annotated[
         int, typer.Option(help="Held-out samples for early decision, at most; 0 leaves it out.")
     ] = 500,
@@ -101,8 +106,9 @@ def evaluate(
 ) -> None:
     """Accuracy of learned features and of baselines on labelled recordings, over settings and time.
 
-    Samples of validation and test splits are scored; without such a split, folds over all samples. With -o
-    every finished run is kept beside the result: the same command goes on after an interruption.
+    Samples of validation and test splits are scored; without such a split, folds over all samples, each a
+    block of neighbours: samples that were cut from one video are near copies. With -o every finished run is
+    kept beside the result: the same command goes on after an interruption.
     """
     from streamfeat.evaluate.page import check_page, write_page
     from streamfeat.evaluate.plan import Trial, parse_sweep, plan_cells
@@ -117,7 +123,7 @@ def evaluate(
             refuse_existing(path, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror}
+    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel}
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
@@ -126,7 +132,7 @@ def evaluate(
             progress_bars(quiet=quiet, as_lines=verbose) as report,
         ):
             report("reading labels", 0, 0, "")
-            data = DataSet(recordings, topic, folds, Trial(**base).seed, on)
+            data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups)
             report("reading labels", 1, 1, "")
             result = run(
                 data,
@@ -162,11 +168,10 @@ def _this_command() -> str:
 def _in_short(row: dict[str, Any]) -> str:
     what = f"{row['method']} {row['swept']} {row['setting'][row['swept']]}" if row["swept"] else row["method"]
     line = f"{what}: {row['accuracy']:.4f} ({row['low']:.4f} to {row['high']:.4f})"
-    if row["swept"]:
-        difference = row["difference"]
-        line += (
-            f", to base {difference['accuracy']:+.4f} ({difference['low']:+.4f} to {difference['high']:+.4f})"
-        )
+    if "difference" in row:
+        to, difference = "base" if row["swept"] else "the first", row["difference"]
+        low, high = difference["low"], difference["high"]
+        line += f", to {to} {difference['accuracy']:+.4f} ({low:+.4f} to {high:+.4f})"
     return f"[dim]{escape(line)}[/]"
 
 
@@ -177,6 +182,7 @@ def _print(result: dict[str, Any]) -> None:
         cells,
         confusion_table,
         early_table,
+        fold_table,
         notes,
         online_table,
         sweep_tables,
@@ -184,6 +190,9 @@ def _print(result: dict[str, Any]) -> None:
 
     columns = [column.replace(", ", ",\n").replace("% ", "%\n") for column in COLUMNS]
     _show("accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
+    header, rows = fold_table(result)
+    if rows:
+        _show("accuracy of each fold", header, rows)
     for name, (header, rows) in sweep_tables(result):
         _show(f"sweep of {name.replace('_', ' ')}", header, rows)
     header, rows = early_table(result)
@@ -195,7 +204,7 @@ def _print(result: dict[str, Any]) -> None:
     for row in base_rows(result) if len(result["labels"]) <= _WIDEST_CONFUSION else []:
         _show(f"confusion of {row['method']}", *confusion_table(row, result["labels"]))
     for note in notes(result):
-        out.print(f"[dim]{escape(note)}[/]")
+        out.print(f"[yellow]{escape(note)}[/]" if note.startswith("WARNING") else f"[dim]{escape(note)}[/]")
 
 
 def _show(

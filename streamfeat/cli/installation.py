@@ -27,6 +27,7 @@ from streamfeat.simulate.saccades import CameraModel, digit_samples
 __all__ = ["EXTRAS", "examine"]
 
 EXTRAS = {
+    "bags": "bags of ROS 1 and 2 as recordings",
     "cluster": "work on other processes and machines",
     "convert": "Prophesee HDF5 files",
     "export": "Arrow, Parquet and pandas",
@@ -34,7 +35,7 @@ EXTRAS = {
     "store": "recordings by URL",
     "view": "Foxglove",
     "bench": "peers in tools/bench",
-    "fuzz": "guided inputs in tools/torture",
+    "fuzz": "guided inputs in tests/torture",
     "test": "the tests",
     "lint": "lint and types",
 }

@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    completing,
     err,
     print_losses,
     print_result,
@@ -32,11 +33,15 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
+from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
+    from streamfeat.classify.classifier import Classifier
+    from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["learn", "train"]
 
@@ -45,11 +50,20 @@ _KEEP_REST = 19
 
 
 @app.command(epilog="Example: streamfeat learn recordings/digits_train.mcap -o model.safetensors")
+@reads_recordings()
 def learn(
     context: typer.Context,
     recordings: RecordingsArgument,
+    reading: "ReadOptions",
     model: Annotated[Path, typer.Option("--output", "-o", help="Model to write.")],
-    formulation: Annotated[str | None, typer.Option(help="direct or inverse.", show_default="direct")] = None,
+    formulation: Annotated[
+        str | None,
+        typer.Option(
+            help="direct or inverse.",
+            show_default="direct",
+            autocompletion=completing("direct", "inverse"),
+        ),
+    ] = None,
     preset: options.Preset = "default",
     encoding: options.Encoding = None,
     filters: options.Filters = None,
@@ -60,7 +74,10 @@ def learn(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
+    start: options.Start = None,
+    rows: options.Rows = None,
     conditioning: options.Conditioning = None,
     coherence: options.Coherence = None,
     log_det: options.LogDet = None,
@@ -95,7 +112,9 @@ def learn(
     part = model.with_name(model.name + ".part")
     try:
         with contextlib.ExitStack() as files:
-            opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
+            opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
+            for rec in opened:
+                print_assumptions(rec.assumptions)
             place = files.enter_context(working(cluster, workers, quiet=quiet))
             report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
             encoder = learn_encoder(
@@ -121,13 +140,21 @@ def learn(
         "bytes": model.stat().st_size,
     }
     entries = encoder.geometry.entries
-    if encoder.formulation == "direct" and encoder.n_filters < entries:
+    if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
         result["log_determinant"] = (
             f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
         )
     print_result(result, "learned", as_json=as_json)
     for rec in opened:
+        print_removed(rec.losses)
         print_losses(rec.losses)
+    if encoder.provenance["volumes"] < setting.volumes:
+        err.print(
+            f"[yellow]{encoder.provenance['volumes']:,} volumes[/] were learned from, not "
+            f"{setting.volumes:,}: no more with events were found in the recordings' "
+            f"{encoder.provenance['windows']:,} windows",
+            soft_wrap=True,
+        )
     if encoder.provenance["interrupted"]:
         err.print(
             f"[yellow]interrupted[/] after {encoder.provenance['iterations']} iterations; "
@@ -154,12 +181,16 @@ def _keeper(path: Path) -> "Keep":
 @app.command(
     epilog="Example: streamfeat train recordings/digits_train.mcap -m model.safetensors -o clf.safetensors"
 )
+@reads_recordings()
 def train(
     recordings: RecordingsArgument,
+    reading: "ReadOptions",
     model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
+    groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
@@ -168,19 +199,30 @@ def train(
     verbose: StepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a linear SVM on labelled samples; splits named validation or test are only scored."""
+    """Train a classifier on labelled samples; splits named validation or test are only scored."""
+    import numpy as np
+
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
+    from streamfeat.classify.folds import assign_folds, groups_named
+    from streamfeat.classify.kernel import train_kernel_classifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, overwrite=overwrite)
+    kind = groups_named(groups)
+    if kernel not in ("linear", "rbf"):
+        raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
     encoder = Encoder.load(model)
     with contextlib.ExitStack() as files:
-        opened = [files.enter_context(open_recording(path, topic)) for path in recordings]
+        opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:
+            print_assumptions(rec.assumptions)
             if not rec.is_labelled:
-                raise InputError(f"{rec.path}: has no labelled samples; `streamfeat convert` writes labels")
+                raise InputError(
+                    f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
+                    "or write them with `streamfeat convert`"
+                )
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)
@@ -189,22 +231,29 @@ def train(
         images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
         report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, images)
+        sources = samples.sources[~samples.held_out].tolist()
+        parts = assign_folds(labels[: len(sources)], sources, folds, kind)
         trained = train_classifier(
-            rows, labels, encoder, groups=numbers, folds=folds, provenance={"mirror": mirror}
+            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
         )
-    trained.save(classifier)
+    found: Classifier | KernelClassifier = trained
+    if kernel == "rbf":
+        found = train_kernel_classifier(rows, trained, np.asarray(labels))
+    found.save(classifier)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
         "labels": ", ".join(trained.labels),
+        "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
     if len(held_out):
-        predicted = [trained.predict(row) for row in held_out]
+        predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
     print_result(result, "trained", as_json=as_json)
     for rec in opened:
+        print_removed(rec.losses)
         print_losses(rec.losses)

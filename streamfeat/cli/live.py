@@ -14,13 +14,17 @@ import typer
 from streamfeat.cli.program import (
     AnyLocation,
     ClusterOption,
+    EmitOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
+    SpeedOption,
+    TopicOption,
     VerboseOption,
     WorkersOption,
     app,
+    completing,
     err,
     out,
     print_losses,
@@ -29,11 +33,20 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
+from streamfeat.cli.reading import (
+    HotPixels,
+    Isolated,
+    Refractory,
+    denoising_of,
+    print_assumptions,
+    reads_recordings,
+)
 from streamfeat.errors import InputError
 from streamfeat.files.locations import location_of
 
 if TYPE_CHECKING:
     from streamfeat.live.names import Names
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["listen", "publish", "record", "recover", "topics"]
 
@@ -74,7 +87,7 @@ def listen(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
+    emit: EmitOption = "auto",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
     ] = None,
@@ -90,6 +103,9 @@ def listen(
     learn_online: Annotated[
         bool, typer.Option("--learn-online", help="Learn from labels published beside the events.")
     ] = False,
+    hot_pixels: HotPixels = None,
+    refractory: Refractory = None,
+    isolated: Isolated = None,
     ros2: RosOption = None,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
@@ -113,7 +129,8 @@ def listen(
     announced: Annotated[
         bool,
         typer.Option(
-            "--announced", help="Hear only cameras with a liveliness token, and no others' packets."
+            "--announced",
+            help="Hear only cameras with a liveliness token; packets of others are not sent here.",
         ),
     ] = False,
     cluster: ClusterOption = None,
@@ -127,7 +144,9 @@ def listen(
 ) -> None:
     """The main job on live topics: one engine for each camera, results published beside it."""
     from streamfeat.live.listen import ListenJob
+    from streamfeat.live.network import Network
     from streamfeat.live.shard import Shard
+    from streamfeat.stream.outputs import Outputs
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -136,9 +155,8 @@ def listen(
     common: dict[str, Any] = {
         "emit": emit,
         "learn_online": learn_online,
-        "reliable": reliable,
-        "zenoh_config": zenoh_config,
-        "port": port,
+        "denoising": denoising_of(hot_pixels, refractory, isolated) or None,
+        "network": Network(zenoh_config, port, reliable),
         "max_delay_s": max_delay,
         "state": state,
     }
@@ -156,12 +174,14 @@ def listen(
     )
     to_terminal = str(json_lines) == "-"
     job.run(
-        console=None if quiet or as_json or to_terminal else out,
-        every_sample=verbose,
-        recording_out=output,
-        json_lines=sys.stdout if to_terminal else json_lines,
-        with_features=features,
-        table=table,
+        Outputs(
+            console=None if quiet or as_json or to_terminal else out,
+            every_sample=verbose,
+            recording=output,
+            json_lines=sys.stdout if to_terminal else json_lines,
+            with_features=features,
+            table=table,
+        )
     )
     if not to_terminal:
         print_result(job.result(), "heard", as_json=as_json)
@@ -193,15 +213,24 @@ def _spread(
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
+@reads_recordings()
 def publish(
     sources: Annotated[
         list[str],
         typer.Argument(metavar="REC KEY...", help="Recordings, each followed by the key it is published on."),
     ],
-    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "1",
+    reading: "ReadOptions",
+    topic: TopicOption = None,
+    speed: SpeedOption = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
-    encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
-    wait: Annotated[float, typer.Option(help="Seconds to wait for somebody to subscribe.")] = 1.0,
+    encoding: Annotated[
+        str,
+        typer.Option(
+            help="Payload: mono, libcaer_cmp, libcaer or evt3.",
+            autocompletion=completing("mono", "libcaer_cmp", "libcaer", "evt3"),
+        ),
+    ] = "mono",
+    wait: Annotated[float, typer.Option(help="Seconds to wait for a subscriber.")] = 1.0,
     ros2: Annotated[bool, typer.Option("--ros2", help="Keys are ROS 2 topics (rmw_zenoh).")] = False,
     domain: DomainOption = 0,
     reliable: ReliableOption = False,
@@ -212,6 +241,7 @@ def publish(
 ) -> None:
     """Recordings as live cameras, at their own pace or faster; several at once."""
     from streamfeat.live.names import PlainNames, RosNames
+    from streamfeat.live.network import Network
     from streamfeat.live.publish import PublishJob
     from streamfeat.stream.replay import parse_speed
 
@@ -223,14 +253,15 @@ def publish(
     job = PublishJob(
         pairs,
         names,
+        topic=topic,
+        reading=reading,
         speed=parse_speed(speed),
         loop=loop,
         encoding=encoding,
-        reliable=reliable,
         wait_s=wait,
-        zenoh_config=zenoh_config,
-        port=port,
+        network=Network(zenoh_config, port, reliable),
     )
+    print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
         job.run(report)
     print_result(job.result(), "published", as_json=as_json)
@@ -240,7 +271,10 @@ def publish(
 def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")],
     key: KeyArgument = None,
-    compression: Annotated[str, typer.Option(help="Chunks: lz4, zstd or none.")] = "lz4",
+    compression: Annotated[
+        str,
+        typer.Option(help="Chunks: lz4, zstd or none.", autocompletion=completing("lz4", "zstd", "none")),
+    ] = "lz4",
     chunk: Annotated[float, typer.Option(help="Seconds that a crash can cost.")] = 0.5,
     ros2: RosOption = None,
     domain: DomainOption = 0,
@@ -252,6 +286,7 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Live topics to MCAP, safe against a crash at any byte; see `streamfeat recover`."""
+    from streamfeat.live.network import Network
     from streamfeat.live.record import RecordJob
 
     refuse_existing(output, overwrite=overwrite)
@@ -261,9 +296,7 @@ def record(
         compression=compression,  # type: ignore[arg-type]
         chunk_s=chunk,
         overwrite=overwrite,
-        reliable=reliable,
-        zenoh_config=zenoh_config,
-        port=port,
+        network=Network(zenoh_config, port, reliable),
         console=err,
     )
     with progress_bars(quiet=quiet) as report:
@@ -282,7 +315,7 @@ def recover(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Whatever can be read of a damaged recording, in a new and intact one."""
+    """Copy everything readable of a damaged recording into a new, intact one."""
     from streamfeat.recordings.writer import recover as recover_recording
 
     with progress_bars(quiet=quiet) as report:
@@ -299,12 +332,14 @@ def topics(
     port: PortOption = 7447,
     as_json: JsonOption = False,
 ) -> None:
-    """Event topics that somebody publishes on, plain zenoh and ROS 2."""
+    """Topics that events are published on, plain zenoh and ROS 2."""
     from dataclasses import asdict
 
-    from streamfeat.live.network import find_topics, open_session
+    from streamfeat.live.network import Network, find_topics
 
-    with open_session(zenoh_config, port=port) as session:
+    if not 0 <= seconds < 1e6:
+        raise InputError(f"--seconds {seconds}: give a number from 0 on")
+    with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
     if as_json:
         print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)
@@ -313,4 +348,4 @@ def topics(
         where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"
         out.print(f"{topic.name}  [dim]{where}, publishers: {topic.publishers}[/]", soft_wrap=True)
     if not found:
-        out.print("nobody publishes events")
+        out.print("no topic with events was found")

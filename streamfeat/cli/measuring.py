@@ -24,14 +24,17 @@ from streamfeat.cli.program import (
     StepsOption,
     TopicOption,
     app,
+    completing,
     err,
     out,
     progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
 
 if TYPE_CHECKING:
     from streamfeat.latency.measure import LatencyReport
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["latency"]
 
@@ -42,13 +45,19 @@ _NOTABLE_STEAL = 0.05
     epilog="Example: streamfeat latency recordings/digits_test.mcap -m recordings/digits.safetensors "
     "--plot latency.html"
 )
+@reads_recordings()
 def latency(
     recording: RecordingArgument,
+    reading: "ReadOptions",
     models: Annotated[
         list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
     ],
     emit: Annotated[
-        list[str], typer.Option(help="When to read features: event, 1000ev, 10ms or auto; may be repeated.")
+        list[str],
+        typer.Option(
+            help="When to emit features: event, 1000ev, 10ms or auto; may be repeated.",
+            autocompletion=completing("event", "1000ev", "10ms", "auto"),
+        ),
     ] = ["event", "10ms", "auto"],  # noqa: B006  (Typer's way; it is never changed)
     look_ahead: Annotated[
         bool, typer.Option(help="Prepare bin boundaries beforehand where every event is followed.")
@@ -83,6 +92,7 @@ def latency(
         models,
         emit,
         topic=topic,
+        reading=reading,
         split=split,
         warm_up=warm_up,
         limit_events=limit_events,
@@ -90,6 +100,7 @@ def latency(
         speed=speed,
         look_ahead=look_ahead,
     )
+    print_assumptions(report.assumptions)
     try:
         with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")

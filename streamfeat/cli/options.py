@@ -1,13 +1,14 @@
 """Options for what learning can be told, as `learn` and `evaluate` have them.
 
 Lives here: each option once, and a setting made of those that were given.
-Not here: what they mean (`learn.setting`).
+Not here: what they mean (`learn.settings`).
 """
 
 from typing import Annotated, Any
 
 import typer
 
+from streamfeat.cli.program import completing
 from streamfeat.learn.settings import DEFAULTS, PRESETS, preset_with
 
 __all__ = [
@@ -17,14 +18,19 @@ __all__ = [
     "Downsample",
     "Encoding",
     "Filters",
+    "Groups",
     "Iterations",
+    "Kernel",
+    "Lambda0",
     "LogDet",
     "MaxCount",
     "Mirror",
     "Patch",
     "Pooling",
     "Preset",
+    "Rows",
     "Seed",
+    "Start",
     "Stride",
     "Threshold",
     "Volumes",
@@ -38,10 +44,20 @@ def _shown(name: str) -> str:
     return str((DEFAULTS | PRESETS["default"])[name])
 
 
-Preset = Annotated[str, typer.Option(help=f"Values of all options that are not given: {', '.join(PRESETS)}.")]
+Preset = Annotated[
+    str,
+    typer.Option(
+        help=f"Values of all options that are not given: {', '.join(PRESETS)}.",
+        autocompletion=completing(*PRESETS),
+    ),
+]
 Encoding = Annotated[
     str | None,
-    typer.Option(help="What is pooled: soft, split or triangle.", show_default=_shown("encoding")),
+    typer.Option(
+        help="What is pooled: soft, split or triangle.",
+        show_default=_shown("encoding"),
+        autocompletion=completing("soft", "split", "triangle"),
+    ),
 ]
 Filters = Annotated[
     int | None, typer.Option(help="Number of filters or atoms, K.", show_default=_shown("filters"))
@@ -71,19 +87,46 @@ Pooling = Annotated[
         help="Cells along each side, in each of which codes are summed.", show_default=_shown("pooling")
     ),
 ]
+Lambda0 = Annotated[
+    float | None,
+    typer.Option(
+        help="Sparsity penalty in learning.", show_default="2 if direct (0.5 with free rows), 1 if inverse"
+    ),
+]
 Threshold = Annotated[
     float | None,
-    typer.Option(help="Sparsity penalty lambda0.", show_default="0.5 if direct, 1 if inverse"),
+    typer.Option(
+        help="Threshold of encoding, in units of unit-length filters.", show_default=_shown("threshold")
+    ),
+]
+Start = Annotated[
+    str | None,
+    typer.Option(
+        help="Of learning: kmeans or random.",
+        show_default=_shown("start"),
+        autocompletion=completing("kmeans", "random"),
+    ),
+]
+Rows = Annotated[
+    str | None,
+    typer.Option(
+        help="Length of the filters while they are learned: unit, or free; direct only.",
+        show_default=_shown("rows"),
+        autocompletion=completing("unit", "free"),
+    ),
 ]
 Conditioning = Annotated[
-    float | None, typer.Option(help="Weight of |A|^2 / 2; direct only.", show_default="0.1")
+    float | None, typer.Option(help="Weight of |A|^2 / 2; free rows only.", show_default="0.1")
 ]
 Coherence = Annotated[
     float | None,
-    typer.Option(help="Weight of |A'A - I|^2 / 4.", show_default="0.02 if direct, 0.1 if inverse"),
+    typer.Option(
+        help="Weight of |A'A - I|^2 / 4; free rows or inverse only.",
+        show_default="0.02 if direct, 0.1 if inverse",
+    ),
 ]
 LogDet = Annotated[
-    float | None, typer.Option(help="Weight of -log|det A'A|; direct only.", show_default="0.1")
+    float | None, typer.Option(help="Weight of -log|det A'A|; free rows only.", show_default="0.1")
 ]
 Volumes = Annotated[
     int | None, typer.Option(help="Local volumes to learn from.", show_default=_shown("volumes"))
@@ -95,6 +138,24 @@ Seed = Annotated[int | None, typer.Option(help="Of every random choice.", show_d
 
 Mirror = Annotated[
     bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")
+]
+
+
+Kernel = Annotated[
+    str,
+    typer.Option(
+        help="Of the classifier: linear, or rbf, which is more accurate and takes about a millisecond for an "
+        "emission; --emit event and --learn-online use the linear one beside it.",
+        autocompletion=completing("linear", "rbf"),
+    ),
+]
+
+Groups = Annotated[
+    str,
+    typer.Option(
+        help="Samples that stay on one side of a fold: block, neighbours in the order of their sources; "
+        "source, those of one source; or none."
+    ),
 ]
 
 

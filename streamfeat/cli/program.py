@@ -38,17 +38,20 @@ if TYPE_CHECKING:
 __all__ = [
     "AnyLocation",
     "ClusterOption",
+    "EmitOption",
     "JsonOption",
     "ModelOption",
     "OverwriteOption",
     "QuietOption",
     "RecordingArgument",
     "RecordingsArgument",
+    "SpeedOption",
     "StepsOption",
     "TopicOption",
     "VerboseOption",
     "WorkersOption",
     "app",
+    "completing",
     "err",
     "out",
     "print_losses",
@@ -63,7 +66,7 @@ _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
 class _InOrder(TyperGroup):
-    """Commands in the order in which somebody new needs them, each with its whole first sentence."""
+    """Commands in the order in which a newcomer needs them, each with its whole first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -81,12 +84,43 @@ app = typer.Typer(
     cls=_InOrder,
     help="Learned features from event cameras: event by event, exact, and never behind.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain pages: for others Typer imports a parser of Markdown, a third of a start
     pretty_exceptions_enable=False,
 )
 
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=lambda asked: _tell_version(asked), help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"streamfeat {version('streamfeat')}")
+        raise typer.Exit
+
+
+def completing(*values: str) -> Callable[[str], list[str]]:
+    """A function for a shell that completes the value of an option: those that begin as what is typed."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [value for value in values if value.startswith(incomplete)]
+
+    return complete
+
 
 if TYPE_CHECKING:
     AnyLocation = Location
@@ -95,13 +129,29 @@ else:
     AnyLocation = type("path|URL", (), {"__doc__": "A path, or the URL of something in a store."})
 RecordingArgument = Annotated[
     AnyLocation,
-    typer.Argument(metavar="REC", help="MCAP recording of events, or its URL.", parser=location_of),
+    typer.Argument(metavar="REC", help="Recording: MCAP, bag, camera file; or its URL.", parser=location_of),
 ]
 RecordingsArgument = Annotated[
     list[AnyLocation],
-    typer.Argument(metavar="REC...", help="MCAP recordings of events, or their URLs.", parser=location_of),
+    typer.Argument(metavar="REC...", help="Recordings, or their URLs.", parser=location_of),
 ]
-TopicOption = Annotated[str | None, typer.Option(help="Event topic, where a recording has several.")]
+TopicOption = Annotated[
+    str | None,
+    typer.Option("--topic", "--stream", help="Event topic or stream, where a recording has several."),
+]
+EmitOption = Annotated[
+    str,
+    typer.Option(
+        help="When to emit features: event, 1000ev, 10ms or auto.",
+        autocompletion=completing("event", "1000ev", "10ms", "auto"),
+    ),
+]
+SpeedOption = Annotated[
+    str,
+    typer.Option(
+        help="1 is the recorded pace, 2 twice that, or max.", autocompletion=completing("1", "2", "max")
+    ),
+]
 ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
@@ -117,7 +167,7 @@ ClusterOption = Annotated[
     typer.Option(metavar="ADDRESS", help="Work on the cluster of this Dask scheduler; extra `cluster`."),
 ]
 WorkersOption = Annotated[
-    int | None, typer.Option(help="Work in so many processes of this machine; extra `cluster`.")
+    int | None, typer.Option(help="Number of processes of this machine to work in; extra `cluster`.")
 ]
 
 _NARROW = 90
@@ -133,7 +183,7 @@ class _RateColumn(ProgressColumn):
 
 
 Report = Callable[[str, int, int, str], None]
-"""Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
+"""Called with (step, done, of how many, remark); of how many is 0 where that is unknown."""
 
 
 @contextlib.contextmanager
@@ -147,7 +197,7 @@ def progress_bars(
 
     Args:
         from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
-            called, once a second at most, so that nothing else runs while somebody measures.
+            called, once a second at most, so that nothing else runs during a measurement.
         quiet: show nothing.
         as_lines: in place of bars a line for each step's begin and end, and one a second between them,
             terminal or not.
@@ -190,7 +240,7 @@ def progress_bars(
 
 
 def _lines() -> Report:
-    """What prints steps as lines."""
+    """A function that prints steps as lines."""
     printed: dict[str, float] = {}
 
     def report(step: str, done: int, total: int, remark: str) -> None:

@@ -4,7 +4,7 @@ Lives here: their arguments, and how their results are shown.
 Not here: reading and writing (`recording`, `recorder`, `foreign`).
 """
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -25,8 +25,12 @@ from streamfeat.cli.program import (
     progress_bars,
     working,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
 from streamfeat.files.locations import location_of
+
+if TYPE_CHECKING:
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["convert", "info"]
 
@@ -34,11 +38,19 @@ _FAULTS_SHOWN = 20
 
 
 @app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
-def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonOption = False) -> None:
+@reads_recordings()
+def info(
+    recording: RecordingArgument,
+    reading: "ReadOptions",
+    topic: TopicOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording."""
+    from streamfeat.messages.timeline import TIMELINE_COUNTS
     from streamfeat.recordings.reader import open_recording
 
-    with open_recording(recording, topic) as rec:
+    with open_recording(recording, topic, reading) as rec:
+        print_assumptions(rec.assumptions)
         with progress_bars() as report:
             report("reading", 0, 0, "")
             n_events = rec.n_events  # reads the whole file
@@ -62,24 +74,38 @@ def info(recording: RecordingArgument, topic: TopicOption = None, as_json: JsonO
             "samples": len(rec.labels),
             "labels": ", ".join(labels),
             "splits": ", ".join(splits),
+            "digest": rec.digest,
+            **{name.replace(" ", "_"): rec.counts[name] for name in TIMELINE_COUNTS},
             "integrity": "damaged" if rec.losses else "intact",
-        }
+        } | rec.removed
         print_result(result, str(recording), as_json=as_json)
         print_losses(rec.losses)
 
 
-@app.command(epilog="Example: streamfeat convert n-cars_train ncars.mcap --split-every 5")
+@app.command(epilog="Example: streamfeat convert n-cars_train ncars.mcap --hold-out 1/5")
+@reads_recordings()
 def convert(
     source: Annotated[
         AnyLocation,
-        typer.Argument(metavar="IN", help="Data set folder or camera file, or its URL.", parser=location_of),
+        typer.Argument(metavar="IN", help="Data set folder or recording, or its URL.", parser=location_of),
     ],
     target: Annotated[
-        AnyLocation, typer.Argument(metavar="OUT.mcap", help="Recording to write.", parser=location_of)
+        AnyLocation,
+        typer.Argument(metavar="OUT", help=".mcap, .raw, .h5, .npz or .csv.", parser=location_of),
     ],
-    split_every: Annotated[
-        int | None,
-        typer.Option(help="Every n-th sample is split 'validation', the others 'train'."),
+    reading: "ReadOptions",
+    topic: TopicOption = None,
+    start: Annotated[float | None, typer.Option(help="Seconds after the first event to begin at.")] = None,
+    end: Annotated[float | None, typer.Option(help="Seconds after the first event to end at.")] = None,
+    crop: Annotated[
+        str | None, typer.Option(metavar="X,Y,W,H", help="Take these pixels only; X,Y becomes 0,0.")
+    ] = None,
+    hold_out: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="Block I of N of each class is split 'validation', else 'train'."),
+    ] = None,
+    interleaved: Annotated[
+        int | None, typer.Option(help="Every n-th sample is 'validation': only where neighbours differ.")
     ] = None,
     split: Annotated[str | None, typer.Option(help="Split of all samples, whatever folders say.")] = None,
     limit: Annotated[int | None, typer.Option(help="Convert only so many, classes in balance.")] = None,
@@ -93,27 +119,66 @@ def convert(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="List every file with a fault.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A data set folder or a camera file to MCAP, with labels and splits from the folder layout.
+    """A data set folder to MCAP, with labels and splits; or a recording, or some of it, to another format.
 
-    Files that cannot be read are reported, and the others converted; the exit status is 1 then.
+    Files of a data set that cannot be read are reported, and the others converted; the exit status is 1 then.
     """
     from streamfeat.convert import datasets
+    from streamfeat.convert.export import convert_recording
+    from streamfeat.convert.selection import Selection
+    from streamfeat.convert.splits import parse_hold_out
 
     if not 0 < gap_ms < 1e9:
         raise InputError(f"a gap of {gap_ms} ms is not possible; give at least one window")
+    selection = Selection.parse(start, end, crop)
+    block = parse_hold_out(hold_out) if hold_out is not None else None
+    formats = {"overwrite": overwrite, "encoding": encoding, "compression": compression}
+    if not datasets.is_data_set(source):
+        if block or interleaved or split or limit:
+            raise InputError(
+                f"{source}: is one recording; --hold-out, --interleaved, --split and --limit are for folders "
+                "of samples"
+            )
+        with progress_bars(quiet=quiet) as report:
+            exported = convert_recording(
+                source,
+                target,
+                topic,
+                reading,
+                selection,
+                progress=lambda n, total: report("converting", n, total, ""),
+                **formats,  # type: ignore[arg-type]
+            )
+        print_assumptions(exported.assumptions)
+        print_result(exported.result() | {"written": str(target)}, "converted", as_json=as_json)
+        print_losses(exported.losses)
+        if exported.losses:
+            raise typer.Exit(1)
+        return
+    if selection or reading.labels or topic:
+        raise InputError(
+            f"{source}: is a folder of samples; --start, --end, --crop, --topic and --labels are for one "
+            "recording"
+        )
+    if interleaved:
+        err.print(
+            "[yellow]interleaved:[/] where samples were cut from video, neighbours are near copies and none "
+            "is held out; --hold-out 1/5 takes blocks",
+            soft_wrap=True,
+        )
     with working(cluster, workers, quiet=quiet) as place, progress_bars(quiet=quiet) as report:
         done = datasets.convert(
             source,
             target,
-            overwrite=overwrite,
             gap_us=round(gap_ms * 1000),
             split=split,
-            split_every=split_every,
-            encoding=encoding,
-            compression=compression,  # type: ignore[arg-type]
+            hold_out=block,
+            interleaved=interleaved,
             limit=limit,
+            denoising=reading.denoising,
             progress=lambda n, total: report("converting", n, total, ""),
             workers=place,
+            **formats,  # type: ignore[arg-type]
         )
     result: dict[str, Any] = {
         "written": str(target),
@@ -123,7 +188,7 @@ def convert(
         "bytes_out": done.bytes_out,
         "failed": len(done.failed),
         "damaged": len(done.damaged),
-    }
+    } | done.removed
     faults = {"failed": done.failed, "damaged": done.damaged}
     if as_json:
         result["faults"] = [

@@ -6,16 +6,18 @@ Not here: the job (`replay`).
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from streamfeat.cli.program import (
+    EmitOption,
     JsonOption,
     ModelOption,
     OverwriteOption,
     QuietOption,
     RecordingArgument,
+    SpeedOption,
     TopicOption,
     VerboseOption,
     app,
@@ -25,6 +27,10 @@ from streamfeat.cli.program import (
     progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
+
+if TYPE_CHECKING:
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["replay"]
 
@@ -33,14 +39,16 @@ __all__ = ["replay"]
     epilog="Example: streamfeat replay recordings/digits_test.mcap -m recordings/digits.safetensors "
     "-c recordings/digits_classifier.safetensors"
 )
+@reads_recordings()
 def replay(
     recording: RecordingArgument,
     model: ModelOption,
+    reading: "ReadOptions",
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: Annotated[str, typer.Option(help="When to read features: event, 1000ev, 10ms or auto.")] = "auto",
-    speed: Annotated[str, typer.Option(help="1 is the recorded pace, 2 twice that, or max.")] = "max",
+    emit: EmitOption = "auto",
+    speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
     ] = None,
@@ -64,7 +72,8 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """The main job on a recording: events to features to predictions, scored where there are labels."""
-    from streamfeat.stream.replay import ReplayJob
+    from streamfeat.stream.outputs import Outputs
+    from streamfeat.stream.replay import ReplayJob, parse_speed
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
@@ -74,21 +83,25 @@ def replay(
         model,
         classifier,
         emit=emit,
-        speed=speed,
+        speed=parse_speed(speed),
         topic=topic,
+        reading=reading,
         split=split,
         learn_online=learn_online,
     )
+    print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"
     with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
         job.run(
-            console=None if quiet or as_json or to_terminal else out,
-            every_sample=verbose,
-            recording_out=output,
-            json_lines=sys.stdout if to_terminal else json_lines,
-            with_features=features,
-            table=table,
-            report=report,
+            Outputs(
+                console=None if quiet or as_json or to_terminal else out,
+                every_sample=verbose,
+                recording=output,
+                json_lines=sys.stdout if to_terminal else json_lines,
+                with_features=features,
+                table=table,
+            ),
+            report,
         )
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json)

@@ -5,46 +5,28 @@ Not here: the formats of single files (`event_files`) and MCAP itself (`streamfe
 """
 
 import contextlib
-import re
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from streamfeat.camera_files.event_files import EXTENSIONS, open_events
+from streamfeat.convert.splits import SamplePath, hold_out_block, interleave, split_named, spread
+from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.locations import Location, StoreLocation, fetched, files_below, is_folder, location_of
+from streamfeat.recordings.bags import is_bag
 from streamfeat.recordings.reader import Label
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["Conversion", "SamplePath", "convert", "find_samples"]
+__all__ = ["Conversion", "SamplePath", "convert", "find_samples", "is_data_set"]
 
-_SPLITS = {
-    "train": "train",
-    "training": "train",
-    "test": "test",
-    "testing": "test",
-    "val": "validation",
-    "valid": "validation",
-    "validation": "validation",
-}
 _LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
 _HELD_IN_MEMORY = 2 << 20  # bytes of a file, at most 96 times that in events; larger files are read twice
-
-
-@dataclass(frozen=True, slots=True)
-class SamplePath:
-    """One sample: its file, class, split ("" where no folder names one) and relative path."""
-
-    path: Location
-    label: str
-    split: str
-    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +34,8 @@ class Conversion:
     """What became of a source: counts of what was written, and a line for each file with a fault.
 
     `failed` files are not in the recording; of `damaged` files, all that could be read is.
-    `bytes_in` counts the files that were converted, `bytes_out` the recording.
+    `bytes_in` counts the files that were converted, `bytes_out` the recording; `removed` the events that were
+    taken out as noise, by reason.
     """
 
     samples: int
@@ -61,6 +44,7 @@ class Conversion:
     damaged: list[tuple[Location, str]]
     bytes_in: int
     bytes_out: int
+    removed: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +89,11 @@ class _Look:
     error: str = ""
 
 
+def is_data_set(place: Location) -> bool:
+    """Whether a place is a folder of samples: one with files of a bag right inside is a recording."""
+    return is_folder(place) and not is_bag(place)
+
+
 def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     """Find the labelled samples of a data set folder.
 
@@ -132,9 +121,9 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
         if hidden or path.suffix.lower() not in EXTENSIONS or not above:
             continue
-        if len(above) == 1 and _split_of(above[0]):
+        if len(above) == 1 and split_named(above[0]):
             continue  # a file right inside a split has no label
-        split = next(filter(None, map(_split_of, [*above[-2::-1], name])), "")
+        split = next(filter(None, map(split_named, [*above[-2::-1], name])), "")
         samples.append(SamplePath(path, above[-1], split, source))
     if not samples:
         raise InputError(
@@ -163,36 +152,40 @@ def convert(
     overwrite: bool = False,
     gap_us: int = 1_000_000,
     split: str | None = None,
-    split_every: int | None = None,
+    hold_out: tuple[int, int] | None = None,
+    interleaved: int | None = None,
     encoding: str = "mono",
     compression: Literal["zstd", "lz4", "none"] = "zstd",
     limit: int | None = None,
+    denoising: Denoising | None = None,
     progress: Callable[[int, int], None] | None = None,
     workers: Workers = THIS_PROCESS,
 ) -> Conversion:
-    """Convert a data set folder, or one event file, to a recording.
+    """Convert a data set folder to a recording.
 
-    Samples of a folder follow each other in order of their relative paths, each announced by its label, with
-    silence of `gap_us` before each and between one's nominal end and the next. In N-CARS, N-MNIST and
-    N-Caltech101 the start of a sample is time 0 of its file; elsewhere it is the first event. A label lasts
-    the nominal duration of its data set, or to its last event where that is later or nothing is nominal.
-    A single file keeps its times and has no label.
+    Samples follow each other in order of their relative paths, each announced by its label, with silence of
+    `gap_us` before each and between one's nominal end and the next. In N-CARS, N-MNIST and N-Caltech101 the
+    start of a sample is time 0 of its file; elsewhere it is the first event. A label lasts the nominal
+    duration of its data set, or to its last event where that is later or nothing is nominal.
 
     Of a source in a store one file at a time is fetched; one that is not given ends the conversion.
 
     Args:
-        source: the folder or file, or its URL.
+        source: the folder, or its URL.
         out: the recording to write, a local file. It appears only when all is written.
         overwrite: replace `out` where it exists.
         gap_us: silence between samples in microseconds, positive; at least one window of the encoder to be.
         split: name for the split of all samples, instead of what their folders say.
-        split_every: every such sample (5: index 4, 9, ...) is split "validation" and the others "train".
-            Samples in test folders stay "test" and are not counted.
+        hold_out: `(i, n)`: block `i` of `n`, of neighbours in each class, is split "validation" and the
+            others "train", see `splits.hold_out_block`. Samples in test folders stay "test".
+        interleaved: every such sample (5: index 4, 9, ...) is split "validation" instead. Where neighbours
+            are near copies, as in what was cut from video, such samples are not held out.
         encoding: of the packets, see `streamfeat.messages.codecs.PAYLOAD_ENCODINGS`.
         compression: of the chunks, see `RecordingWriter`.
         limit: convert only so many samples, as many of each label as the others have.
+        denoising: noise to take out of each sample.
         progress: called with samples done and samples in all, after each.
-        workers: read the files of a folder, but for large ones; the recording is written here.
+        workers: read the files, but for large ones; the recording is written here.
 
     Raises:
         InputError: `source` cannot be read at all, `out` cannot be written, or an argument is out of range.
@@ -200,38 +193,24 @@ def convert(
     source, out = location_of(source), location_of(out)
     if isinstance(out, StoreLocation):
         raise InputError(f"{out}: recordings are written to local files; give one, and copy it to the store")
-    if gap_us <= 0 or (limit is not None and limit <= 0) or (split_every is not None and split_every < 2):
-        raise InputError("gap_us and limit must be positive, split_every at least 2")
-    if split is not None and split_every is not None:
-        raise InputError("split and split_every exclude each other; give one")
-    if not is_folder(source):
-        with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
-            n, damage, bytes_in = _write_file(source, writer)
-        if progress:
-            progress(1, 1)
-        return Conversion(0, n, [], [(source, damage)] if damage else [], bytes_in, out.stat().st_size)
+    if gap_us <= 0 or (limit is not None and limit <= 0) or (interleaved is not None and interleaved < 2):
+        raise InputError("gap_us and limit must be positive, interleaved at least 2")
+    if sum(choice is not None for choice in (split, hold_out, interleaved)) > 1:
+        raise InputError("--split, --hold-out and --interleaved exclude each other; give one")
     samples = find_samples(source)
     data_set = _recognise(samples)
-    if split_every is not None:
-        samples = _hold_out(samples, split_every)
+    if hold_out is not None:
+        samples = hold_out_block(samples, *hold_out)
+    elif interleaved is not None:
+        samples = interleave(samples, interleaved)
     elif split is not None:
         samples = [replace(sample, split=split) for sample in samples]
     if limit is not None:
-        samples = _spread(samples, limit)
+        samples = spread(samples, limit)
+    denoiser = Denoiser(denoising or Denoising())
     with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
-        done = _write_samples(samples, data_set, gap_us, writer, progress, workers)
-    return replace(done, bytes_out=out.stat().st_size)
-
-
-def _write_file(place: Location, writer: RecordingWriter) -> tuple[int, str, int]:
-    """Write one file as it is; return its number of events, its damage and its bytes."""
-    with fetched(place) as path:
-        try:
-            file, damage = _measure(path, None)
-            _write_events(path, file, 0, writer)
-        except InputError as error:
-            raise InputError(_of_place(error, path, place)) from error
-        return file.n, damage, path.stat().st_size
+        done = _write_samples(samples, data_set, gap_us, writer, denoiser, progress, workers)
+    return replace(done, bytes_out=out.stat().st_size, removed=denoiser.removed)
 
 
 def _of_place(error: InputError, path: Path, place: Location) -> str:
@@ -239,14 +218,21 @@ def _of_place(error: InputError, path: Path, place: Location) -> str:
     return str(error).replace(str(path), str(place))
 
 
-def _write_events(path: Location, file: _Measured, shift_us: int, writer: RecordingWriter) -> None:
+def _write_events(
+    path: Location, file: _Measured, shift_us: int, writer: RecordingWriter, denoiser: Denoiser
+) -> int:
+    """Write the events of a sample without their noise; return how many."""
+    denoiser.restart()
+    n = 0
     for batch in file.batches:
-        moved = batch.copy()
+        moved = (denoiser.events(batch, file.resolution) if denoiser.denoising else batch).copy()
+        n += len(moved)
         moved["t"] += shift_us
         try:
             writer.write_events(moved, file.resolution)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
+    return n
 
 
 def _write_samples(
@@ -254,6 +240,7 @@ def _write_samples(
     data_set: _DataSet | None,
     gap_us: int,
     writer: RecordingWriter,
+    denoiser: Denoiser,
     progress: Callable[[int, int], None] | None,
     workers: Workers,
 ) -> Conversion:
@@ -272,9 +259,8 @@ def _write_samples(
                 nominal_us = data_set.duration_us if data_set else 0
                 duration_us = max(nominal_us, file.last_us - origin_us + 1)
                 writer.write_label(Label(start_us, duration_us, sample.label, sample.split, sample.source))
-                _write_events(sample.path, file, start_us - origin_us, writer)
+                n_events += _write_events(sample.path, file, start_us - origin_us, writer, denoiser)
                 start_us += duration_us + gap_us
-                n_events += file.n
                 bytes_in += look.size
                 if look.damage:
                     damaged.append((sample.path, look.damage))
@@ -316,7 +302,7 @@ def _measure(path: Path, data_set: _DataSet | None) -> tuple[_Measured, str]:
             first_us, last_us = min(first_us, int(batch["t"].min())), max(last_us, int(batch["t"].max()))
     if n == 0:
         raise InputError(f"{path}: holds no events")
-    resolution = resolution or file.resolution or (height, width)
+    resolution = resolution or file.declared or (height, width)
     if height > resolution[0] or width > resolution[1]:
         raise InputError(
             f"{path}: events cover {width}x{height} pixels, its data set {resolution[1]}x{resolution[0]}"
@@ -332,30 +318,3 @@ def _recognise(samples: Sequence[SamplePath]) -> _DataSet | None:
     if endings == {".bin"}:
         return _NMNIST if labels <= set("0123456789") else _NCALTECH101
     return None
-
-
-def _hold_out(samples: Sequence[SamplePath], every: int) -> list[SamplePath]:
-    """Mark every so-manieth sample that is not of a test folder as validation, and the others as train."""
-    marked, seen = [], 0
-    for sample in samples:
-        if sample.split != "test":
-            seen += 1
-            sample = replace(sample, split="train" if seen % every else "validation")
-        marked.append(sample)
-    return marked
-
-
-def _spread(samples: Sequence[SamplePath], limit: int) -> list[SamplePath]:
-    """Take the first of each split and label in turns, so that a few samples still hold all of them."""
-    groups = defaultdict(list)
-    for sample in samples:
-        groups[sample.split, sample.label].append(sample)
-    order = sorted((turn, i) for i, group in enumerate(groups.values()) for turn in range(len(group)))
-    listed = list(groups.values())
-    taken = [listed[i][turn] for turn, i in order[:limit]]
-    return sorted(taken, key=lambda sample: sample.source)
-
-
-def _split_of(name: str) -> str:
-    """The split that the last word of a folder's name stands for, or ""."""
-    return _SPLITS.get(re.split(r"[-_ ]", name.lower())[-1], "")

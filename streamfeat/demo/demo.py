@@ -30,10 +30,11 @@ from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.simulate.saccades import CameraModel, digit_samples
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
-from streamfeat.stream.replay import warm_up
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import Sink, TerminalSink
+from streamfeat.stream.warming import warm_up
 
 __all__ = ["FILES", "Demo"]
 

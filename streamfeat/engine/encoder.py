@@ -22,6 +22,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.files.safetensors_file import one_line, read_safetensors, write_safetensors
 from streamfeat.kernels.layout import FEATURE_ENCODINGS, Operator
+from streamfeat.report.shown import Shown
 
 __all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
 
@@ -58,8 +59,8 @@ class FeatureMap(Protocol):
         """Features of one window; see `Encoder.encode`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Encoder:
+@dataclass(frozen=True, slots=True, repr=False)
+class Encoder(Shown):
     """A learned, frozen map from the counts of a window to features.
 
     Make one with `Encoder.build` or `Encoder.load`; the fields are not to be changed.

@@ -11,13 +11,13 @@ time, never on how often it was read or how the stream was cut into batches.
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
+from streamfeat.engine.snapshot import Snapshot, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, as_events
@@ -41,8 +41,9 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
 from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
+from streamfeat.report.shown import Shown
 
-__all__ = ["MOST_THREADS", "Engine", "EngineStats", "Snapshot"]
+__all__ = ["MOST_THREADS", "Engine", "EngineStats"]
 
 MOST_THREADS = 256
 
@@ -74,30 +75,7 @@ class EngineStats:
     encoded_volumes: int
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """All that an engine needs to go on as if nothing had happened.
-
-    Attributes:
-        fingerprint: of the encoder.
-        counts: `(T, H, W)` int32, the ring; bin `b` lives in slot `b % T`.
-        atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        bin: the current one; `BEFORE_TIME` in an engine that has seen nothing.
-        origin_us: stream time at which bin 0 starts.
-        tally: `(5,)` int64, what was counted.
-        encoded: `(2,)` int64, their sum is how many volumes were encoded.
-    """
-
-    fingerprint: str
-    counts: NDArray[np.int32]
-    atoms: NDArray[np.float64]
-    bin: int
-    origin_us: int
-    tally: NDArray[np.int64]
-    encoded: NDArray[np.int64]
-
-
-class Engine:
+class Engine(Shown):
     """Turns a stream of events into features, exactly.
 
     Args:
@@ -135,7 +113,7 @@ class Engine:
             encoder.geometry,
             self._operator,
             resolution,
-            origin_us=self._checked_time(origin_us),
+            origin_us=checked_time(origin_us),
             planes=2 if look_ahead else 1,
             threads=threads,
         )
@@ -228,7 +206,7 @@ class Engine:
     def _is_large(self) -> bool:
         volumes = 0 if self._is_complete else self.grid_shape[0] * self.grid_shape[1]
         touched = int(self._state.clock[CLOCK_TOUCHED])
-        return max(volumes, touched) * self._operator.offset.shape[0] >= _WORTH_SHARING
+        return bool(max(volumes, touched) * self._operator.offset.shape[0] >= _WORTH_SHARING)
 
     def _share(self, work: Callable[[int, Operator, State], None]) -> None:
         """Do the first part of some work here, and the other parts on other threads."""
@@ -255,16 +233,10 @@ class Engine:
         Raises:
             InputError: the time is beyond 2^62 microseconds.
         """
-        since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
+        since = checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
         new = since // self._operator.bin_us
         if new > self._state.clock[CLOCK_NOW]:
             advance_to_bin(new, self._operator, self._state)
-
-    @staticmethod
-    def _checked_time(t_us: int) -> int:
-        if not BEFORE_TIME < t_us < -BEFORE_TIME:
-            raise InputError(f"a time of {t_us} us is beyond 2^62")
-        return int(t_us)
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
@@ -324,7 +296,7 @@ class Engine:
         Raises:
             InputError: the origin is beyond 2^62 microseconds.
         """
-        state, origin = self._state, self._checked_time(origin_us)
+        state, origin = self._state, checked_time(origin_us)
         state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
         for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
             array[:] = 0
@@ -369,7 +341,7 @@ class Engine:
             InputError: the snapshot is of another encoder or another resolution, or of no engine at all;
                 nothing has changed.
         """
-        self._check(snapshot)
+        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state)
         state, limit = self._state, self._operator.max_count
         codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
         self.restart(snapshot.origin_us)
@@ -386,28 +358,3 @@ class Engine:
         state.tally[:] = snapshot.tally
         state.encoded[:] = 0
         state.encoded[0] = snapshot.encoded.sum()
-
-    def _check(self, snapshot: Snapshot) -> None:
-        state, operator = self._state, self._operator
-        if snapshot.fingerprint != self.encoder.fingerprint:
-            raise InputError(
-                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
-                f"{self.encoder.fingerprint[:12]}"
-            )
-        encoded = np.zeros(2, np.int64)
-        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, encoded)
-        for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
-            given = getattr(snapshot, name)
-            if given.dtype != array.dtype or given.shape != array.shape:
-                raise InputError(
-                    f"the snapshot holds {name} of {given.dtype} {given.shape}, this engine has "
-                    f"{array.dtype} {array.shape}"
-                )
-        # No solution exceeds half of it; one within the gap may, by a little.
-        if not (np.abs(snapshot.atoms) <= 2 * operator.largest).all():
-            raise InputError("the snapshot: an entry of a code is no number, or too large")
-        if min(snapshot.tally.min(), snapshot.encoded.min()) < 0:
-            raise InputError("the snapshot: something was counted less than zero times")
-        self._checked_time(snapshot.origin_us)
-        if snapshot.bin != BEFORE_TIME:
-            self._checked_time(snapshot.origin_us + snapshot.bin * operator.bin_us)

@@ -11,6 +11,8 @@ import numpy as np
 
 from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
+from streamfeat.classify.folds import assign_folds
+from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
@@ -23,6 +25,9 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 __all__ = ["run_cells"]
 
 _SHOWN_FILTERS = 48
+
+_INNER_FOLDS = 3
+"""Of the training samples, by which the classifier's regularisation is chosen."""
 
 
 def run_cells(
@@ -69,7 +74,7 @@ def run_cells(
             all_encoded = time.perf_counter()
         for cell in cells:
             with PeakMemory() as training:
-                result = _scored(cell, data.names, features, samples, images, report)
+                result = _scored(cell, data, features, samples, images, report)
                 if cell.fold == 0 and not cell.swept:
                     classifier = result["classifier"]
                     result |= _looked_into(
@@ -84,7 +89,7 @@ def run_cells(
 
 def _scored(
     cell: Cell,
-    names: Sequence[str],
+    data: DataSet,
     features: FeatureMap,
     samples: EncodedSamples,
     images: EncodedSamples | None,
@@ -92,9 +97,14 @@ def _scored(
 ) -> dict[str, Any]:
     """Train and score; the classifier is part of what is found."""
     started = time.perf_counter()
-    report("training", 0, 0, "3-fold cross-validation")
+    report("training", 0, 0, f"{_INNER_FOLDS}-fold cross-validation")
     rows, labels, numbers = training_set(samples, images if cell.setting.mirror else None)
-    classifier = train_classifier(rows, labels, features, groups=numbers)
+    sources = samples.sources[~samples.held_out].tolist()
+    parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
+    classifier: Classifier | KernelClassifier
+    classifier = linear = train_classifier(rows, labels, features, parts=parts[numbers])
+    if cell.setting.kernel == "rbf":
+        classifier = train_kernel_classifier(rows, linear, np.asarray(labels))
     trained = time.perf_counter()
     report("training", 1, 1, "")
     predicted = predict_all(classifier, samples.rows[samples.held_out])
@@ -104,7 +114,7 @@ def _scored(
         "samples": [int(np.sum(~samples.held_out)), len(true)],
         # A digit for each held-out sample in stored order: settings are compared sample by sample.
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
-        "confusion": confusion(true, predicted, names),
+        "confusion": confusion(true, predicted, data.names),
         "features": features.n_features,
         "C": classifier.provenance["C"],
         "train_s": round(trained - started, 3),
@@ -114,7 +124,7 @@ def _scored(
 def _looked_into(
     cell: Cell,
     features: FeatureMap,
-    classifier: Classifier,
+    classifier: Classifier | KernelClassifier,
     samples: EncodedSamples,
     recordings: Sequence[Recording],
     report: Report,

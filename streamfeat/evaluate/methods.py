@@ -7,17 +7,19 @@ Not here: methods without filters (`surfaces`), and what features are good for (
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
-from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.fit import learn_encoder, prepare
+from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import Recording
-from streamfeat.work.workers import THIS_PROCESS, Sums, Workers
+from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["make_features", "random_filters", "spherical_means"]
+__all__ = ["make_features"]
+
+_MEANS_ITERATIONS = 20
+"""As many passes over the volumes as the direct formulation takes with its start."""
 
 Report = Callable[[str, int, int, str], None]
 """Called with (step, done, of how many, remark)."""
@@ -65,49 +67,6 @@ def _other_filters(
     rng = np.random.default_rng([setting.seed, 1])  # volumes were drawn from the seed alone
     if method == "random":
         return material.encoder(random_filters(setting.filters, material.geometry.entries, rng))
-    return material.encoder(spherical_means(material.white, setting.filters, rng, report=report))
-
-
-def random_filters(n: int, entries: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """`(n, entries)` directions of unit length, each as likely as any other."""
-    rows = rng.standard_normal((n, entries))
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
-
-
-def spherical_means(
-    volumes: ChunkedVolumes,
-    n: int,
-    rng: np.random.Generator,
-    *,
-    iterations: int = 10,
-    report: Report = lambda step, done, total, remark: None,
-) -> NDArray[np.float32]:
-    """Filters `(n, d)` of unit length by spherical k-means (Coates and Ng 2012, section 2.1).
-
-    Each volume `x` has one code that is not zero, `s_j = d_j' x` for the `j` of the largest `|d_j' x|`; then
-    `D := X S' + D` and each column is scaled to unit length. Started, as there, from random directions.
-
-    Args:
-        volumes: `(m, d)` whitened volumes.
-        n: filters.
-        rng: source of every random choice.
-        iterations: ten are enough, they say.
-        report: told about progress.
-    """
-    filters = random_filters(n, volumes.shape[1], rng)
-    for iteration in range(iterations):
-        (totals,) = volumes.total(_nearest_sums, filters)
-        totals += filters
-        filters = np.asarray(totals / np.linalg.norm(totals, axis=1, keepdims=True), np.float32)
-        report("learning", iteration + 1, iterations, "spherical k-means")
-    return filters
-
-
-def _nearest_sums(chunk: NDArray[np.float32], filters: NDArray[np.float32]) -> Sums:
-    """The chunk's part of `S X'`."""
-    likeness = chunk @ filters.T
-    best = np.abs(likeness).argmax(axis=1)
-    codes = np.zeros_like(likeness)
-    rows = np.arange(len(chunk))
-    codes[rows, best] = likeness[rows, best]
-    return ((codes.T @ chunk).astype(np.float64),)
+    return material.encoder(
+        spherical_means(material.white, setting.filters, rng, iterations=_MEANS_ITERATIONS, report=report)
+    )

@@ -18,6 +18,7 @@ from streamfeat.evaluate.tables import (
     base_rows,
     cells,
     early_table,
+    fold_table,
     in_order,
     notes,
     online_table,
@@ -60,7 +61,11 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     machine = ", ".join(f"{name} {value}" for name, value in result["machine"].items())
     numeric = [name not in ("method", "geometry") for name in COLUMNS]
     table = Table(COLUMNS, [cells(row) for row in rows], numeric)
-    sections = [Section("Accuracy", [table, *notes(result), f"Measured on: {machine}."])]
+    accuracy: Parts = [table]
+    header, folds = fold_table(result)
+    if folds:
+        accuracy.append(Table(header, folds, [False] + [True] * (len(header) - 1)))
+    sections = [Section("Accuracy", [*accuracy, *notes(result), f"Measured on: {machine}."])]
     if sweeps := list(_sweeps(result)):
         sections.append(Section("Sweeps", sweeps))
     if early := [row for row in rows if "early" in row]:

@@ -24,9 +24,10 @@ METHODS = {
 }
 """Every method, and what it is."""
 
-_LEARNING = {"iterations", "conditioning", "coherence", "log_det"}
-_NOT_USED = {"inverse": {"conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
-_USED_WITHOUT_FILTERS = {"hats": ("mirror",), "hots": ("seed", "mirror"), "counts": ("mirror",)}
+_LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
+_NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
+_TRAINING = ("mirror", "kernel")
+_USED_WITHOUT_FILTERS = {"hats": _TRAINING, "hots": ("seed", *_TRAINING), "counts": _TRAINING}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,9 +36,17 @@ class Trial(Setting):
 
     Attributes:
         mirror: train on mirror images of the training samples as well.
+        kernel: `linear`, or `rbf`.
     """
 
     mirror: bool = False
+    kernel: str = "linear"
+
+    def __post_init__(self) -> None:
+        """Check the kernel, and all that `Setting` checks."""
+        if self.kernel not in ("linear", "rbf"):
+            raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
+        Setting.__post_init__(self)
 
 
 _DEFAULTS = {field.name: field.default for field in fields(Trial)}
@@ -77,7 +86,7 @@ class Cell:
 
     def has_features_of(self, other: "Cell") -> bool:
         """Whether the same features serve both, so that they need not be made twice."""
-        mine, others = (replace(cell.setting, mirror=False) for cell in (self, other))
+        mine, others = (replace(cell.setting, mirror=False, kernel="linear") for cell in (self, other))
         return (self.method, self.fold, mine) == (other.method, other.fold, others)
 
 
@@ -112,6 +121,7 @@ _KINDS: dict[type, tuple[Any, str]] = {
     int: (int, "integers, such as --sweep {name}=2,4,7"),
     str: (_name, "names, such as --sweep {name}=soft,split"),
     bool: (_truth, "yes and no, such as --sweep {name}=yes,no"),
+    float: (float, "numbers, such as --sweep {name}=0.25,0.5"),
     type(None): (float, "numbers, such as --sweep {name}=0.25,0.5"),
 }
 """By the type of the default: how a value is read, and what to give; None stands in for a number."""

@@ -1,7 +1,7 @@
 """All cells, each kept as soon as it is done, and the result that they add up to.
 
 Lives here: the loop, the state file that an interrupted run goes on from, sums over folds.
-Not here: what a cell does (`cell`), the result as text or page (`words`, `page`).
+Not here: what a cell does (`cell`), the result as text or page (`tables`, `page`).
 """
 
 import json
@@ -11,16 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.evaluate.cell import run_cells
+from streamfeat.evaluate.leakage import check_leakage
 from streamfeat.evaluate.methods import Report
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
 from streamfeat.evaluate.scores import (
     SHARE,
-    bootstrap_interval,
-    fold_interval,
+    accuracy_interval,
     paired_interval,
     time_to_share,
 )
@@ -32,7 +33,13 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
-_VERSION = 2
+_VERSION = 3
+
+_UNITS_IN_WORDS = {
+    "block": "runs of neighbouring samples, 25 of each class",
+    "source": "sources",
+    "none": "samples",
+}
 
 
 def state_path(output: Path) -> Path:
@@ -149,9 +156,11 @@ def evaluate(
         "recordings": [[path.name, size_of(path)] for path in data.paths],
         "folds": data.n_folds,
         "scored": data.scored,
+        "groups": data.groups,
         "early_samples": early_samples,
     }
     kept = StateFile(state, header)
+    leakage = check_leakage(data, report, workers)
     rows: list[dict[str, Any]] = []
     for i, cell in enumerate(cells):
         report("cells", i, len(cells), cell.method + (f", {_swept(cell)}" if cell.swept else ""))
@@ -165,10 +174,10 @@ def evaluate(
             ):
                 kept.add(one, result)
         if cell.fold == data.n_folds - 1:
-            rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)]))
-            if cell.swept:
-                base = [kept.get(c) or {} for c in cells if c.method == cell.method and not c.swept]
-                rows[-1]["difference"] = _difference(rows[-1]["hits"], "".join(f["hits"] for f in base))
+            rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)], data.units))
+            first = next(row for row in rows if row["method"] == cell.method) if cell.swept else rows[0]
+            if rows[-1] is not first:
+                rows[-1]["difference"] = _difference(rows[-1]["hits"], first["hits"], data.units)
             finished(rows[-1])
     report("cells", len(cells), len(cells), "")
     return {
@@ -176,11 +185,8 @@ def evaluate(
         "labels": data.names,
         "samples": {"training": rows[0]["samples"][0], "held_out": rows[0]["samples"][1]},
         "split": data.scored,
-        "interval": (
-            "95 % bootstrap interval over held-out samples"
-            if data.n_folds == 1
-            else f"95 % interval of the mean over {data.n_folds} stratified folds (Student's t)"
-        ),
+        "interval": f"95 % bootstrap interval over {_UNITS_IN_WORDS[data.groups]}",
+        "leakage": leakage,
         "rows": rows,
         "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
         "machine": describe_machine(),
@@ -193,9 +199,9 @@ def save_result(path: Path, result: dict[str, Any]) -> None:
     state_path(path).unlink(missing_ok=True)
 
 
-def _difference(hits: str, base: str) -> dict[str, float]:
-    """Of a swept setting to the base setting, on the same samples."""
-    low, high = paired_interval(hits, base)
+def _difference(hits: str, base: str, units: NDArray[np.int64]) -> dict[str, float]:
+    """To the first method, or of a swept setting to the base setting, on the same samples."""
+    low, high = paired_interval(hits, base, units)
     difference = (hits.count("1") - base.count("1")) / len(hits)
     return {name: round(v, 4) for name, v in (("accuracy", difference), ("low", low), ("high", high))}
 
@@ -209,21 +215,20 @@ def _folds_of(cell: Cell, cells: Sequence[Cell]) -> list[Cell]:
     return [other for other in cells if (other.method, other.setting, other.swept) == same]
 
 
-def _row(cell: Cell, folds: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _row(cell: Cell, folds: Sequence[dict[str, Any]], units: NDArray[np.int64]) -> dict[str, Any]:
     """One row of the result from the folds of one method and setting."""
-    right = [fold["hits"].count("1") for fold in folds]
-    scored = [fold["samples"][1] for fold in folds]
-    accuracies = [r / n for r, n in zip(right, scored, strict=True)]
-    low, high = fold_interval(accuracies) if len(folds) > 1 else bootstrap_interval(right[0], scored[0])
+    accuracies = [fold["hits"].count("1") / fold["samples"][1] for fold in folds]
+    hits = "".join(fold["hits"] for fold in folds)
+    low, high = accuracy_interval(hits, units)
     row: dict[str, Any] = {
         "method": cell.method,
         "swept": cell.swept,
         "setting": cell.used,
-        "accuracy": round(float(np.mean(accuracies)), 4),
-        "low": round(max(low, 0.0), 4),
-        "high": round(min(high, 1.0), 4),
+        "accuracy": round(hits.count("1") / len(hits), 4),
+        "low": round(low, 4),
+        "high": round(high, 4),
         "folds": [round(a, 4) for a in accuracies],
-        "hits": "".join(fold["hits"] for fold in folds),
+        "hits": hits,
         "samples": folds[0]["samples"],
         "features": folds[0]["features"],
         "C": [fold["C"] for fold in folds],

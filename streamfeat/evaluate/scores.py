@@ -9,18 +9,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from streamfeat.classify.classifier import Classifier, OnlineClassifier
 from streamfeat.classify.features import encode_samples
+from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.engine.encoder import FeatureMap
 from streamfeat.recordings.reader import Sample
 
 __all__ = [
-    "bootstrap_interval",
+    "accuracy_interval",
     "confusion",
     "early_decision",
-    "fold_interval",
     "paired_interval",
     "predict_all",
     "prequential",
@@ -35,43 +34,45 @@ _TIMES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 _FIRST_EVENTS = 50
 
 
-def bootstrap_interval(right: int, n: int, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of an accuracy, over test samples (Efron 1979).
+def accuracy_interval(hits: str, units: NDArray[np.int64], seed: int = 0) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of an accuracy (Efron 1979); units are drawn whole.
 
-    Drawing `n` of `n` samples again with replacement makes the number of right ones binomial.
+    Args:
+        hits: a digit for each sample, 1 where it was recognised.
+        units: `(n,)` of each sample, see `classify.folds.bootstrap_units`.
+        seed: of the resampling.
     """
-    drawn = np.random.default_rng(seed).binomial(n, right / n, _RESAMPLES) / n
-    low, high = np.percentile(drawn, (2.5, 97.5))
-    return float(low), float(high)
+    return _interval(_digits(hits), units, seed)
 
 
-def fold_interval(accuracies: Sequence[float]) -> tuple[float, float]:
-    """95 % interval of the mean over folds, by Student's t.
+def paired_interval(hits: str, base: str, units: NDArray[np.int64], seed: int = 0) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of a difference in accuracy on the same samples.
 
-    Folds share training samples, so it is a little narrow.
-    """
-    n, mean = len(accuracies), float(np.mean(accuracies))
-    half = float(student.ppf(0.975, n - 1) * np.std(accuracies, ddof=1) / np.sqrt(n))
-    return mean - half, mean + half
-
-
-def paired_interval(hits: str, base: str, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of a difference in accuracy on the same samples, drawn in pairs.
-
-    Drawing samples again with replacement makes the numbers of those that only one of the two has right
-    multinomial. So what both have right, or wrong, does not widen it, as in the test of McNemar (1947).
+    What both have right, or wrong, does not widen it, as in the test of McNemar (1947).
 
     Args:
         hits: a digit for each sample, 1 where it was recognised.
         base: the same of what it is compared with.
+        units: `(n,)` of each sample.
         seed: of the resampling.
     """
-    gained, lost = (sum(a > b for a, b in zip(*pair, strict=True)) for pair in ((hits, base), (base, hits)))
-    n = len(hits)
-    drawn = np.random.default_rng(seed).multinomial(
-        n, [gained / n, lost / n, (n - gained - lost) / n], _RESAMPLES
-    )
-    low, high = np.percentile((drawn[:, 0] - drawn[:, 1]) / n, (2.5, 97.5))
+    return _interval(_digits(hits) - _digits(base), units, seed)
+
+
+def _digits(hits: str) -> NDArray[np.int64]:
+    return np.frombuffer(hits.encode(), np.uint8).astype(np.int64) - ord("0")
+
+
+def _interval(values: NDArray[np.int64], units: NDArray[np.int64], seed: int) -> tuple[float, float]:
+    """Of the mean of `values`, `(n,)`."""
+    number = np.unique(units, return_inverse=True)[1]
+    sums, sizes = np.bincount(number, values).astype(np.int64), np.bincount(number)
+    # Units of one sum and one size are drawn as one kind: how often is multinomial.
+    kinds, counts = np.unique(np.stack([sums, sizes]), axis=1, return_counts=True)
+    rng = np.random.default_rng(seed)
+    drawn = rng.multinomial(len(sums), counts / len(sums), _RESAMPLES)
+    means = (drawn @ kinds[0]) / (drawn @ kinds[1])
+    low, high = np.percentile(means, (2.5, 97.5))
     return float(low), float(high)
 
 
@@ -83,13 +84,13 @@ def confusion(true: Sequence[str], predicted: Sequence[str], names: Sequence[str
     return [[int(count) for count in row] for row in matrix]
 
 
-def predict_all(classifier: Classifier, features: NDArray[np.float32]) -> list[str]:
+def predict_all(classifier: Classifier | KernelClassifier, features: NDArray[np.float32]) -> list[str]:
     """The label with the highest score for each row of `(n, F)` features."""
     return [classifier.labels[i] for i in classifier.scores(features).argmax(axis=-1)]
 
 
 def early_decision(
-    features: FeatureMap, classifier: Classifier, samples: Sequence[Sample]
+    features: FeatureMap, classifier: Classifier | KernelClassifier, samples: Sequence[Sample]
 ) -> dict[str, list[dict[str, float]]]:
     """Accuracy when a sample has been seen for some time only, or some of its events.
 

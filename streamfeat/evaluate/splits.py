@@ -12,8 +12,8 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from sklearn.model_selection import StratifiedKFold
 
+from streamfeat.classify.folds import assign_folds, bootstrap_units, groups_named
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, absolute
 from streamfeat.recordings.reader import (
@@ -27,6 +27,12 @@ from streamfeat.recordings.reader import (
 )
 
 __all__ = ["DataSet", "Fold"]
+
+_FOLDS_IN_WORDS = {
+    "block": "folds, each a block of neighbouring samples of every class",
+    "source": "folds of whole sources",
+    "none": "stratified folds of shuffled samples",
+}
 
 
 class Fold(Recording):
@@ -70,33 +76,44 @@ class Fold(Recording):
 class DataSet:
     """Labelled recordings, and which of their samples are scored.
 
-    Those of held-out splits are; where there is none, or `on` says so, stratified folds of the others are
+    Those of held-out splits are, as they are; where there is none, or `on` says so, folds of the others are
     scored in turn, and held-out samples are not there.
 
     Args:
         paths: the recordings, which are one data set together.
         topic: as for `open_recording`.
         folds: how many, where no held-out split is scored.
-        seed: of the folds.
+        seed: of folds that are shuffled.
+        groups: which samples are never on two sides of a fold, see `classify.folds`.
         on: `held-out`, or `train` for folds of the samples that are not held out.
 
     Attributes:
         labels: of all samples in stored order, of each recording.
         names: the classes, sorted.
+        groups: as given.
+        seed: as given.
         scored: what is scored, in words.
         n_folds: 1 where that is a held-out split.
+        units: the unit of each scored sample that a bootstrap draws whole, in stored order, fold after fold.
 
     Raises:
         InputError: a label is missing, there are fewer than two classes, nothing to learn from or nothing to
-            score.
+            score, or the samples cannot be cut into such folds.
     """
 
     def __init__(
-        self, paths: Sequence[Location], topic: str | None, folds: int, seed: int, on: str = "held-out"
+        self,
+        paths: Sequence[Location],
+        topic: str | None,
+        folds: int,
+        seed: int,
+        on: str = "held-out",
+        groups: str = "block",
     ) -> None:
         """Read the labels."""
         if on not in ("held-out", "train"):
             raise InputError(f"--on {on} is unknown; choose held-out or train")
+        self.groups, self.seed = groups_named(groups), seed
         self.paths = list(paths)
         self._topic = topic
         self.labels: list[list[Label]] = []
@@ -120,6 +137,8 @@ class DataSet:
         self._folds: list[list[frozenset[Label]]] = []
         if any(held_out) and on == "held-out":
             self.scored, self.n_folds = "the recording's held-out split", 1
+            scored = [label for label in every if label.split in HELD_OUT_SPLITS]
+            self.units = bootstrap_units(*_columns(scored), self.groups)
             return
         self.labels = [[a for a in labels if a.split not in HELD_OUT_SPLITS] for labels in self.labels]
         every = [label for labels in self.labels for label in labels]
@@ -129,26 +148,24 @@ class DataSet:
                 f"{where}: no sample is of a held-out split that is to be scored "
                 f"({', '.join(sorted(HELD_OUT_SPLITS))}); --folds {folds} leaves nothing, give at least 2"
             )
-        if min(counts.values()) < folds:
-            rarest = min(counts, key=lambda name: counts[name])
-            raise InputError(
-                f"{where}: label {rarest!r} has {counts[rarest]} samples, fewer than {folds} folds; "
-                "add samples or give fewer --folds"
-            )
+        try:
+            folded = assign_folds(*_columns(every), folds, self.groups, seed)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
         self.n_folds = folds
-        self.scored = f"{folds} folds" + (
+        self.scored = f"{folds} {_FOLDS_IN_WORDS[self.groups]}" + (
             " of the training samples, without those held out" if any(held_out) else ""
         )
-        targets = np.array([label.label for label in every])
         cuts = np.cumsum([0, *map(len, self.labels)])
-        splitter = StratifiedKFold(folds, shuffle=True, random_state=seed)
+        tests = [np.flatnonzero(folded == fold) for fold in range(folds)]
         self._folds = [
             [
                 frozenset(every[i] for i in test[(test >= start) & (test < stop)])
                 for start, stop in itertools.pairwise(cuts)
             ]
-            for _, test in splitter.split(targets, targets)
+            for test in tests
         ]
+        self.units = bootstrap_units(*_columns(every), self.groups)[np.concatenate(tests)]
 
     @contextlib.contextmanager
     def open(self, fold: int) -> Iterator[list[Recording]]:
@@ -161,6 +178,11 @@ class DataSet:
                     files.enter_context(Fold(path, self._topic, held_out))
                     for path, held_out in zip(self.paths, self._folds[fold], strict=True)
                 ]
+
+
+def _columns(labels: Sequence[Label]) -> tuple[list[str], list[str]]:
+    """Their names and their sources."""
+    return [label.label for label in labels], [label.source for label in labels]
 
 
 def _check_labels(path: Location, labels: Sequence[Label]) -> None:

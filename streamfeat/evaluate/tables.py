@@ -15,6 +15,7 @@ __all__ = [
     "cells",
     "confusion_table",
     "early_table",
+    "fold_table",
     "in_order",
     "notes",
     "online_table",
@@ -32,6 +33,7 @@ COLUMNS = (
     "features",
     "accuracy",
     "95 % interval",
+    "to the first",
     "learn, s",
     "encode, s",
     "train, s",
@@ -54,6 +56,7 @@ def cells(row: dict[str, Any]) -> list[str]:
         f"{row['features']:,}",
         f"{row['accuracy']:.3f}",
         _interval(row),
+        _to_base(row) if "difference" in row else "",
         f"{row['learn_s']:.1f}",
         f"{row['encode_s']:.1f}",
         f"{row['train_s']:.1f}",
@@ -115,11 +118,26 @@ def value_text(value: Any) -> str:
 
 def _measured(row: dict[str, Any]) -> list[str]:
     """Accuracy, and the difference to the base setting, each with its interval."""
+    return [f"{row['accuracy']:.3f} ({_interval(row)})", _to_base(row)]
+
+
+def _to_base(row: dict[str, Any]) -> str:
     difference = row["difference"]
-    return [
-        f"{row['accuracy']:.3f} ({_interval(row)})",
-        f"{difference['accuracy']:+.3f} ({difference['low']:+.3f} to {difference['high']:+.3f})",
-    ]
+    return f"{difference['accuracy']:+.3f} ({difference['low']:+.3f} to {difference['high']:+.3f})"
+
+
+def fold_table(result: dict[str, Any]) -> Lines:
+    """Accuracy of each method in each fold; no row where there is but one."""
+    rows = [row for row in result["rows"] if len(row["folds"]) > 1]
+    header = ("method", *(f"fold {i + 1}" for i in range(len(rows[0]["folds"]) if rows else 0)))
+    return header, [[_name(row), *(f"{accuracy:.3f}" for accuracy in row["folds"])] for row in rows]
+
+
+def _name(row: dict[str, Any]) -> str:
+    """The method, and what is varied."""
+    if not row["swept"]:
+        return str(row["method"])
+    return f"{row['method']}, {row['swept'].replace('_', ' ')} {value_text(row['setting'][row['swept']])}"
 
 
 def online_table(result: dict[str, Any]) -> Lines:
@@ -163,9 +181,17 @@ def notes(result: dict[str, Any]) -> list[str]:
     lines = [
         f"{', '.join(result['recordings'])}: {samples['training']:,} samples to learn from, "
         f"{samples['held_out']:,} held out; split: {result['split']}; {result['interval']}.",
-        "Every method's features go through the same normalisation and linear SVM. Encoding is of all "
+        "Every method's features go through the same normalisation and classifier, a linear SVM or, with "
+        "kernel rbf, Gaussian kernel ridge. Encoding is of all "
         "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
+    if leakage := result["leakage"]:
+        lines.append(_leakage_note(leakage))
+    if len(base_rows(result)) > 1:
+        lines.append(
+            "To the first: the difference in accuracy to the first method on the same samples, with its "
+            "paired interval."
+        )
     setting = next((row["setting"] for row in base_rows(result) if "patch" in row["setting"]), None)
     if setting:
         lines.append(
@@ -182,8 +208,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     swept = {row["swept"] for row in result["rows"] if row["swept"]}
     if swept:
         lines.append(
-            "To base: the difference in accuracy to the base setting on the same samples, with its 95 % "
-            "interval by a bootstrap of pairs."
+            "To base: the difference in accuracy to the base setting on the same samples, with its paired "
+            "interval."
         )
     if swept & result["published"]["sweeps"].keys():
         lines.append(
@@ -206,3 +232,17 @@ def notes(result: dict[str, Any]) -> list[str]:
             f"shuffled {online['shuffled']['label_changes']:,} times: few changes make it easy."
         )
     return lines
+
+
+def _leakage_note(leakage: dict[str, Any]) -> str:
+    """What a nearest neighbour says of how samples are held out."""
+    text = (
+        f"Near copies: a nearest neighbour on 12x12 counts is right for {leakage['shuffled']:.1%} of samples "
+        f"under shuffled folds, {leakage['blocks']:.1%} under blocks, {leakage['scored']:.1%} as scored here."
+    )
+    if leakage["leaks"]:
+        return (
+            f"WARNING: {text} Neighbours are near copies and stand on both sides of this split: the figures "
+            "are too high for new data. Score folds with --groups block, or hold out blocks."
+        )
+    return f"{text} Neighbours are near copies, and are kept on one side." if leakage["copies"] else text

@@ -31,6 +31,7 @@ __all__ = [
     "files_below",
     "is_folder",
     "location_of",
+    "natural_order",
     "open_binary",
     "size_of",
 ]
@@ -90,6 +91,11 @@ def location_of(text: "str | PathLike[str] | StoreLocation") -> Location:
     if isinstance(text, str) and _URL.match(text):
         return StoreLocation(text)
     return Path(text)
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """A key that sorts names as people do: 9 before 10."""
+    return [(int(part), "") if i % 2 else (-1, part) for i, part in enumerate(re.split(r"(\d{1,18})", name))]
 
 
 def absolute(place: Location) -> Location:

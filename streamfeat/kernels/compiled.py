@@ -1,6 +1,6 @@
 """How every kernel is compiled.
 
-Lives here: the two decorators of the kernels. Not here: the kernels.
+Lives here: the two decorators of the kernels, and the one of their vector code. Not here: the kernels.
 
 Kernels are compiled without numba's reference counts. With them each call of one kernel from another counts
 every array up and down, atomically, in tuples of forty: 480 ns an event, where counting it takes 10. An
@@ -8,7 +8,11 @@ array that a caller holds outlives the call, so nothing is lost by it; and a ker
 allocate an array does not compile.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 from numba import njit
+from numba.extending import intrinsic
 
 kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 """Compiled once for each set of argument types, kept on disk, and free of the GIL while it runs."""
@@ -17,3 +21,6 @@ inlined = njit(  # type: ignore[call-overload]
     cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True
 )
 """The same for small parts of a loop over events: a call would copy all arrays' descriptions."""
+
+generated: Callable[[Callable[..., Any]], Callable[..., Any]] = intrinsic
+"""A function whose machine code its body writes, in LLVM's own terms; for `vectors` alone."""

@@ -1,8 +1,9 @@
-"""Packet words to events, where each word depends on the ones before it.
+"""Packet words to events, and the span of time that a packet's events cover.
 
-Lives here: the two encodings of 16-bit words, one short loop each, writing to `out`.
-Not here: payload checks, capacity, and the encodings of fixed-size records, which NumPy reads by itself;
-see `streamfeat.messages.codecs`.
+Lives here: the encodings of 16-bit words, where each depends on the ones before it, and `mono`, where one
+pass takes a fifth of the time of a pass for each field; one short loop each, writing to `out`.
+Not here: payload checks, capacity, and the encoding that NumPy reads by itself (`libcaer`); see
+`streamfeat.messages.codecs`.
 """
 
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 from streamfeat.events import Events
 from streamfeat.kernels.compiled import kernel
 
-__all__ = ["decode_evt3", "decode_libcaer_cmp"]
+__all__ = ["decode_evt3", "decode_libcaer_cmp", "decode_mono", "time_span"]
 
-# A TIME_HIGH that goes back by at most this many steps is a late word; by more, a wrap of its 12 bits.
-TIME_HIGH_BACKSTEP = 10
+# A TIME_HIGH that goes back by less than half of its 12 bits is late or has a flipped bit; by more, a wrap.
+TIME_HIGH_BACKSTEP = 0x7FF
 
 
 @kernel
@@ -117,4 +118,48 @@ def decode_libcaer_cmp(words: NDArray[np.uint16], base_us: int, state: NDArray[n
         else:
             return -1 - i
     state[0], state[1], state[2] = x, base, polarity
+    return n
+
+
+@kernel
+def decode_mono(words: NDArray[np.uint64], base_us: int, rest_ns: int, out: Events) -> None:
+    """Decode mono words.
+
+    Args:
+        words: `(n,)` uint64, not changed.
+        base_us: time of the packet, whole microseconds.
+        rest_ns: what the time of the packet has beyond those, 0 to 999 ns.
+        out: `(n,)` `EVENT_DTYPE`, changed.
+    """
+    for i, word in enumerate(words):
+        out[i].x = (word >> 32) & 0xFFFF
+        out[i].y = (word >> 48) & 0x7FFF
+        out[i].p = word >> 63
+        out[i].t = base_us + (rest_ns + np.int64(word & 0xFFFFFFFF)) // 1000
+
+
+@kernel
+def time_span(events: Events, height: int, width: int, span: NDArray[np.int64]) -> int:
+    """Find the earliest and the latest time of the events that lie on the sensor.
+
+    Args:
+        events: `(n,)` `EVENT_DTYPE`, not changed.
+        height: of the sensor, pixels.
+        width: of the sensor, pixels.
+        span: `(2,)` int64, changed: earliest and latest time; as it was where no event is on the sensor.
+
+    Returns:
+        How many events are on the sensor.
+    """
+    n = 0
+    first = last = np.int64(0)
+    for i in range(len(events)):
+        if events[i].x < width and events[i].y < height:
+            t = events[i].t
+            if n == 0:
+                first = last = t
+            first, last = min(first, t), max(last, t)
+            n += 1
+    if n:
+        span[0], span[1] = first, last
     return n

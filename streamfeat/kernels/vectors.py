@@ -13,7 +13,8 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+
+from streamfeat.kernels.compiled import generated
 
 __all__ = ["copy_eight", "filled_mask", "lowest_bit", "sum_pairs"]
 
@@ -45,7 +46,7 @@ def _load(builder: Any, array: Any, index: Any, kind: Any, align: int = 2) -> An
     return loaded
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@generated
 def copy_eight(typing: Any, source: Any, start: Any, target: Any, to: Any) -> Any:
     """Copy eight int16 numbers: `target[to : to + 8] = source[start : start + 8]`."""
 
@@ -61,7 +62,7 @@ def copy_eight(typing: Any, source: Any, start: Any, target: Any, to: Any) -> An
     return types.void(source, types.int64, target, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@generated
 def filled_mask(typing: Any, values: Any, start: Any) -> Any:
     """Bit `i` tells whether `values[start + i]`, of 64 int16 numbers, is not zero; uint64."""
 
@@ -75,7 +76,7 @@ def filled_mask(typing: Any, values: Any, start: Any) -> Any:
     return types.uint64(values, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@generated
 def lowest_bit(typing: Any, mask: Any) -> Any:
     """Index of the lowest bit that is set; the mask is not zero."""
 
@@ -85,7 +86,7 @@ def lowest_bit(typing: Any, mask: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@generated
 def sum_pairs(typing: Any, pairs: Any, entries: Any, changes: Any, columns: Any, sums: Any) -> Any:
     """Sums of multiples of columns, two columns at a time, each block of filters in registers throughout.
 
@@ -104,7 +105,7 @@ def sum_pairs(typing: Any, pairs: Any, entries: Any, changes: Any, columns: Any,
         vectors = builder.udiv(width, _int64(BLOCK))
         blocks = builder.udiv(builder.add(vectors, _int64(WIDEST - 1)), _int64(WIDEST))
         narrow, wider = builder.udiv(vectors, blocks), builder.urem(vectors, blocks)
-        start = cgutils.alloca_once_value(builder, _int64(0))
+        start = cgutils.alloca_once_value(builder, _int64(0))  # type: ignore[no-untyped-call]
         with cgutils.for_range(builder, blocks) as loop:
             more = builder.zext(builder.icmp_unsigned("<", loop.index, wider), _I64)
             size, first = builder.add(narrow, more), builder.load(start)
@@ -155,7 +156,7 @@ def _sum_block(builder: Any, pairs: Any, arrays: list[Any], width: Any, first: A
         builder.add(builder.mul(builder.zext(builder.load(place), _I64), width), first)
         for place in (builder.gep(entries.data, [builder.add(item, _int64(i))]) for i in range(2))
     ]
-    following = []
+    following: list[Any] = []
     for vector in range(vectors):
         at = _int64(vector * BLOCK)
         both = [_load(builder, columns, builder.add(start, at), column) for start in starts]

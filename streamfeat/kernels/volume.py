@@ -172,7 +172,7 @@ def list_entries(
     """
     n = 0
     for first in range(start // MASK_BITS * MASK_BITS, end, MASK_BITS):
-        mask = filled_mask(values, first)
+        mask: np.uint64 = filled_mask(values, first)
         if first < start:
             mask &= ~np.uint64(0) << np.uint64(start - first)
         if end - first < MASK_BITS:

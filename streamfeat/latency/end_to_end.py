@@ -146,7 +146,7 @@ class _WatchedSession(Session):
             yield emission
 
     def finish(self) -> Iterator[Emission]:
-        """Read nothing: when the stream ends is not the recording's doing but that of who measures."""
+        """Emit nothing: the measurement ends the stream, not the recording."""
         return iter(())
 
 

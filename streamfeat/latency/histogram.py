@@ -9,18 +9,19 @@ import numpy as np
 from hdrh.histogram import HdrHistogram
 from numpy.typing import NDArray
 
-__all__ = ["PERCENTILES", "Latencies"]
+__all__ = ["PERCENTILES", "Latencies", "RecentLatencies"]
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9)
 
 _LONGEST_NS = 60 * 10**9
 _DIGITS = 3
+_RECENT = 65_536
 
 
 class Latencies:
     """How long things took, in nanoseconds, to 3 significant digits and up to 60 s.
 
-    All figures come from one HDR histogram, so that whoever decodes it finds the same ones.
+    All figures come from one HDR histogram, so that decoding it gives the same ones.
 
     Args:
         ns: `(n,)` int64; not changed. What is above 60 s counts as 60 s.
@@ -86,3 +87,29 @@ class Latencies:
             ns.append(float(self._histogram.get_highest_equivalent_value(item.value_iterated_to)))
             before = item.total_count_to_this_value
         return np.array(beyond), np.array(ns)
+
+
+class RecentLatencies:
+    """How long things took lately, one after the other: the latest 65,536, and up to as many before them.
+
+    A run of any length holds two histograms. One thread adds; any thread may ask.
+    """
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self._current, self._before = (HdrHistogram(1, _LONGEST_NS, _DIGITS) for _ in range(2))
+
+    def add(self, ns: float) -> None:
+        """Count one, in nanoseconds; what is below 1 ns or above 60 s counts as that."""
+        if self._current.get_total_count() >= _RECENT:
+            self._before, self._current = self._current, HdrHistogram(1, _LONGEST_NS, _DIGITS)
+        self._current.record_value(min(max(round(ns), 1), _LONGEST_NS))
+
+    def percentiles(self, *percents: float) -> list[tuple[str, float]]:
+        """Name and seconds of each percentile, such as `("p99", 0.0012)`; empty before the first value."""
+        total = HdrHistogram(1, _LONGEST_NS, _DIGITS)
+        total.add(self._before)
+        total.add(self._current)
+        if total.get_total_count() == 0:
+            return []
+        return [(f"p{percent:g}", total.get_value_at_percentile(percent) / 1e9) for percent in percents]

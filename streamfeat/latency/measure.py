@@ -1,7 +1,7 @@
 """One latency report: every model with every emission policy, update and end to end.
 
 Lives here: opening what a report needs, the order of measurements, rows, the result as JSON values.
-Not here: the measurements (`update`, `hop`), how rows look (`picture`, `cli`).
+Not here: the measurements (`update`, `end_to_end`), how rows look (`picture`, `cli`).
 """
 
 import time
@@ -20,6 +20,7 @@ from streamfeat.latency.end_to_end import measure_end_to_end
 from streamfeat.latency.histogram import Latencies
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Label, Packet, Recording, open_recording
 from streamfeat.report.machine import Disturbance, describe_machine
 from streamfeat.stream.emission import EmitPolicy
@@ -85,6 +86,7 @@ class LatencyReport:
         models: files of encoders.
         emits: emission policies, see `EmitPolicy.parse`.
         topic: event topic, where there are several.
+        reading: how to read the recording.
         split: measure on samples of this split only.
         warm_up: events at the start that run but are not counted.
         limit_events: events to count at most in each measurement of updates.
@@ -103,6 +105,7 @@ class LatencyReport:
         emits: Sequence[str],
         *,
         topic: str | None = None,
+        reading: ReadOptions = AS_IT_IS,
         split: str | None = None,
         warm_up: int = 2_000,
         limit_events: int = 50_000,
@@ -121,6 +124,7 @@ class LatencyReport:
                 raise InputError(f"{name} {count} is not possible; give at least {least}")
         self._policies = [(emit, EmitPolicy.parse(emit)) for emit in dict.fromkeys(emits)]
         self._recording, self._topic, self._split = recording, topic, split
+        self._reading = reading
         self._warm_up, self._limit = warm_up, limit_events
         self._seconds, self._speed, self._look_ahead = seconds, speed, look_ahead
         names = [path.stem for path in models]
@@ -128,7 +132,8 @@ class LatencyReport:
             Model(path.stem if names.count(path.stem) == 1 else str(path), Encoder.load(path))
             for path in models
         ]
-        with open_recording(recording, topic) as rec:
+        with open_recording(recording, topic, reading) as rec:
+            self.assumptions = rec.assumptions
             self._items = self._load(rec)
         self._check_fit(models)
         self.rows: list[Row] = []
@@ -157,7 +162,7 @@ class LatencyReport:
             stopped: asked often whether to end early, with what has been measured so far.
         """
         disturbance = Disturbance()
-        with open_recording(self._recording, self._topic) as rec:
+        with open_recording(self._recording, self._topic, self._reading) as rec:
             for model in self._models:
                 for emit, policy in self._policies:
                     found = self._rows_of(_Job(model, emit, policy, rec, report, stopped))

@@ -1,6 +1,6 @@
 """A latency report in words and numbers.
 
-Lives here: rows as text, models in one line, and what somebody must know who reads the figures.
+Lives here: rows as text, models in one line, and notes for readers of the figures.
 Not here: tables and pictures that show them (`cli`, `picture`).
 """
 
@@ -46,7 +46,7 @@ def describe(model: Model) -> str:
 
 
 def notes(report: LatencyReport) -> list[str]:
-    """What somebody must know who reads the figures."""
+    """Notes for readers of the figures."""
     result = report.result()
     machine = result["machine"]
     said = [

@@ -1,7 +1,7 @@
 """Update latency: from events in an engine's hands to features that are current.
 
 Lives here: walking a stream event by event, and by an emission policy, with the time each step takes.
-Not here: queues, threads and sinks on the way to a user (`hop`).
+Not here: queues, threads and sinks on the way to a user (`end_to_end`).
 
 Both walks go through a stream as a session does: a label starts an empty window with its own origin, and
 packets of another resolution start a new engine. None of that is timed. A new engine's memory is written

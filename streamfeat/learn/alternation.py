@@ -16,8 +16,9 @@ from sklearn.utils import check_random_state
 
 from streamfeat.errors import InputError
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
-from streamfeat.learn.initial import random_directions
+from streamfeat.learn.initial import STARTS, check_usable, random_directions, spherical_means
 from streamfeat.learn.omega import condition_number, mutual_coherence
+from streamfeat.work.workers import one_blas_thread
 
 __all__ = ["Alternation", "Step"]
 
@@ -41,6 +42,8 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         max_iter: iterations at most, each of two half-steps.
         tol: stop when an iteration lowers the objective by less than this share.
         chunk_size: volumes whose codes are held as floats at a time by each thread.
+        start: `kmeans`, spherical k-means; or `random`, random volumes, from which both formulations stay in
+            poorer minima (on N-CARS two to three points).
         warm_start: start from `components_` of the fit before.
         random_state: seed of the initial rows.
         progress: called with (iteration, objective) after each iteration, whose attributes are there then.
@@ -49,6 +52,7 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     max_iter: int = 20
     tol: float = 1e-4
     chunk_size: int = 2048
+    start: str = "kmeans"
     warm_start: bool = False
     random_state: int | None = None
     progress: Callable[[int, float], None] | None = None
@@ -69,6 +73,11 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self._check_numbers()
         volumes = checked_volumes(self, X, self.chunk_size)
         self._check(volumes.shape[0])
+        with one_blas_thread():
+            return self._fit(volumes)
+
+    def _fit(self, volumes: ChunkedVolumes) -> Self:
+        """Learn; matrices are small, and threads of BLAS would wait for whatever else runs here."""
         squares = volumes.squared_lengths()
         rows = self._first_rows(volumes, squares)
         objective: list[float] = []
@@ -113,6 +122,8 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 f"K is {k}, max_iter {self.max_iter} and chunk_size {self.chunk_size}; "
                 "each must be at least one"
             )
+        if self.start not in STARTS:
+            raise InputError(f"start is {self.start!r}, it must be one of {', '.join(STARTS)}")
 
     def _check(self, n_volumes: int) -> None:
         """Refuse parameters that cannot be used; subclasses check theirs as well."""
@@ -128,7 +139,10 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         shape = self._n_rows, volumes.shape[1]
         if not (self.warm_start and hasattr(self, "components_")):
             rng = check_random_state(self.random_state)
-            return random_directions(volumes, squares, self._n_rows, rng)
+            if self.start == "random":
+                return random_directions(volumes, squares, self._n_rows, rng)
+            check_usable(squares)
+            return spherical_means(volumes, self._n_rows, np.random.default_rng(rng.randint(2**31)))
         if self.components_.shape != shape:
             raise InputError(
                 f"warm_start: components_ have shape {self.components_.shape}, {shape} is to be learned; "

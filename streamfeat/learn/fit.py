@@ -80,13 +80,15 @@ class Material:
     """Whitened volumes `(n, d)`, made a chunk at a time."""
 
     def encoder(self, filters: NDArray[np.float32], provenance: Mapping[str, Any] | None = None) -> Encoder:
-        """The encoder with these `(K, d)` filters."""
+        """The encoder with these `(K, d)` filters, each scaled to unit length."""
+        lengths = np.linalg.norm(filters.astype(np.float64), axis=1, keepdims=True)
+        lengths[(np.abs(lengths - 1) < 1e-6) | (lengths < 1e-12)] = 1  # those of unit length keep their bits
         return Encoder.build(
             self.geometry,
             formulation=self.setting.formulation,
             encoding=self.setting.encoding,
-            threshold=self.setting.penalty,
-            filters=filters,
+            threshold=self.setting.threshold,
+            filters=filters / lengths,
             whitening=self.whitener.whitening_,
             mean=self.whitener.mean_,
             eps=self.whitener.eps,
@@ -95,23 +97,29 @@ class Material:
 
 
 def prepare(
-    recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers = THIS_PROCESS
+    recordings: Sequence[Recording],
+    setting: Setting,
+    report: Report,
+    workers: Workers = THIS_PROCESS,
+    geometry: Geometry | None = None,
 ) -> Material:
     """Sample volumes and learn their whitening; samples of held-out splits are not looked at.
 
     Recordings are read once, in parts, for a sample of volumes, which is kept as small integers:
-    `volumes * d` bytes. No float copy of it is made.
+    `volumes * d` bytes. No float copy of it is made. Without `window_ms` and `geometry` labels have to be
+    known first: that is one pass more.
 
     Args:
         recordings: open recordings.
         setting: geometry, number of volumes, seed.
         report: told about progress.
         workers: read and compute; what comes out is the same wherever that is.
+        geometry: that of `geometry_of`, where it is known.
 
     Raises:
         InputError: no usable volume was found, or there are too few.
     """
-    geometry = geometry_of(setting, recordings, workers)
+    geometry = geometry or geometry_of(setting, recordings, workers)
     volumes = _sample(recordings, setting, geometry, report, workers)
     remark = f"{len(volumes.counts):,} volumes, {volumes.empty_share:.1%} of places were empty"
     report("whitening", 0, 1, remark)
@@ -192,7 +200,7 @@ def learn_encoder(
     (`provenance["interrupted"]`).
 
     Args:
-        recordings: open recordings; read once, see `prepare`.
+        recordings: open recordings; read as often as `prepare` says.
         setting: geometry and learning; iterations are those beyond `resume`.
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.
@@ -206,9 +214,12 @@ def learn_encoder(
     """
     learner = _learner(setting)
     weights = {name: getattr(learner, name) for name in _WEIGHTS if hasattr(learner, name)}
+    if setting.formulation == "direct" and setting.rows == "unit":
+        weights = {}
+    geometry = geometry_of(setting, recordings, workers)
     if resume:
-        _check_resumable(resume, setting, geometry_of(setting, recordings, workers), weights)
-    material = prepare(recordings, setting, report, workers)
+        _check_resumable(resume, setting, geometry, weights)
+    material = prepare(recordings, setting, report, workers, geometry)
     volumes = material.volumes
     volumes_hash = hashlib.sha256(volumes.counts.tobytes()).hexdigest()
     if resume and resume.provenance.get("volumes_sha256") != volumes_hash:
@@ -225,6 +236,9 @@ def learn_encoder(
             "volumes_sha256": volumes_hash,
             "empty_share": round(volumes.empty_share, 4),
             "seed": setting.seed,
+            "lambda0": setting.penalty,
+            "start": setting.start,
+            "rows": setting.rows,
             "weights": weights,
             "iterations": learner.n_iter_,
             "interrupted": interrupted,
@@ -237,6 +251,9 @@ def learn_encoder(
         if resume:
             for name in _HISTORY:
                 provenance[name] = resume.provenance[name] + provenance[name]
+        if setting.rows == "free":
+            lengths = np.linalg.norm(learner.components_.astype(np.float64), axis=1)
+            provenance["lengths"] = [float(length) for length in lengths]
         return material.encoder(learner.components_, provenance)
 
     def learned(iteration: int, objective: float) -> None:
@@ -245,7 +262,8 @@ def learn_encoder(
 
     learner.set_params(progress=learned)
     if resume:
-        learner.set_params(warm_start=True).components_ = resume.filters
+        lengths = np.array(resume.provenance.get("lengths", [1.0]), np.float32)
+        learner.set_params(warm_start=True).components_ = resume.filters * lengths[:, np.newaxis]
     learner.fit(material.white)
     if learner.interrupted_ and learner.n_iter_ == 0:
         raise KeyboardInterrupt
@@ -257,10 +275,13 @@ def _learner(setting: Setting) -> TransformLearner | DictionaryLearner:
     learner = kind(
         setting.filters,
         threshold=setting.penalty,
+        start=setting.start,
         max_iter=setting.iterations,
         random_state=setting.seed,
     )
     learner.set_params(**setting.weights)
+    if setting.formulation == "direct":
+        learner.set_params(rows=setting.rows)
     return learner
 
 
@@ -273,13 +294,15 @@ def _check_resumable(
     resume: Encoder, setting: Setting, geometry: Geometry, weights: Mapping[str, float]
 ) -> None:
     """Refuse to go on from a model that was learned with other parameters."""
-    if not resume.provenance.keys() >= {"volumes_sha256", "weights", *_HISTORY}:
+    if not resume.provenance.keys() >= {"volumes_sha256", "weights", "lambda0", "rows", *_HISTORY}:
         raise InputError("the model to go on from does not say how it was learned; learn anew")
     asked = {
         "geometry": (resume.geometry, geometry),
         "formulation": (resume.formulation, setting.formulation),
         "encoding": (resume.encoding, setting.encoding),
-        "threshold": (resume.threshold, setting.penalty),
+        "lambda0": (resume.provenance["lambda0"], setting.penalty),
+        "threshold": (resume.threshold, setting.threshold),
+        "rows": (resume.provenance["rows"], setting.rows),
         "filters": (resume.n_filters, setting.filters),
         "weights": (resume.provenance["weights"], weights),
     }

@@ -13,7 +13,7 @@ from streamfeat.errors import InputError
 if TYPE_CHECKING:
     from streamfeat.engine.encoder import Encoding, Formulation
 
-__all__ = ["DEFAULTS", "PRESETS", "THRESHOLDS", "Setting", "preset_with"]
+__all__ = ["DEFAULTS", "PRESETS", "THRESHOLD", "Setting", "preset_with"]
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -28,12 +28,17 @@ PRESETS: dict[str, dict[str, Any]] = {
         "downsample": 2,
         "max_count": 127,
         "encoding": "triangle",
+        "volumes": 50_000,
+        "iterations": 20,
     },
 }
 """What each preset has other than the defaults of `Setting`."""
 
-THRESHOLDS = {"direct": 0.5, "inverse": 1.0}
-"""Default sparsity penalty of each formulation."""
+LAMBDAS = {("direct", "unit"): 2.0, ("direct", "free"): 0.5, ("inverse", "unit"): 1.0}
+"""Default sparsity penalty in learning, of each formulation and kind of rows."""
+
+THRESHOLD = 1.0
+"""Default threshold of encoding."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,10 +59,13 @@ class Setting:
         downsample: sensor pixels along each side of a ring pixel.
         max_count: counts are clipped to `[-max_count, max_count]`.
         pooling: cells along each side of the grid of volumes; codes are summed over each cell.
-        threshold: `lambda0`, in learning and in use; None for that of `THRESHOLDS`.
-        conditioning: weight in `Omega`; None for the learner's own, as for the next two. Direct only.
-        coherence: weight in `Omega`.
-        log_det: weight in `Omega`. Direct only.
+        lambda0: sparsity penalty in learning; None for that of `LAMBDAS`.
+        threshold: of encoding, in units of unit-length filters.
+        start: of learning, `kmeans` or `random`.
+        rows: whether filters have unit length as they are learned, `unit` or `free`; `free` is direct only.
+        conditioning: weight in `Omega`; None for the learner's own, as for the next two. Free rows only.
+        coherence: weight in `Omega`. Free rows or inverse only.
+        log_det: weight in `Omega`. Free rows only.
         volumes: local volumes to learn from.
         iterations: alternations at most.
         seed: of every random choice.
@@ -76,12 +84,15 @@ class Setting:
     downsample: int = 1
     max_count: int = 1
     pooling: int = 2
-    threshold: float | None = None
+    lambda0: float | None = None
+    threshold: float = THRESHOLD
+    start: str = "kmeans"
+    rows: str = "unit"
     conditioning: float | None = None
     coherence: float | None = None
     log_det: float | None = None
-    volumes: int = 50_000
-    iterations: int = 20
+    volumes: int = 12_500
+    iterations: int = 10
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -97,8 +108,14 @@ class Setting:
             raise InputError(f"{self.bins} bins are not possible; give at least one")
         if self.window_ms is not None and not 0 < self.window_ms < 1e9:
             raise InputError(f"a window of {self.window_ms} ms is not possible")
-        if not 0 <= self.penalty < math.inf or (self.formulation == "inverse" and self.penalty == 0):
-            raise InputError(f"threshold is {self.penalty}, it must be finite and above zero")
+        for name, kinds in (("start", ("kmeans", "random")), ("rows", ("unit", "free"))):
+            if getattr(self, name) not in kinds:
+                raise InputError(f"{name} is {getattr(self, name)!r}, it must be one of {', '.join(kinds)}")
+        if self.formulation == "inverse" and self.rows != "unit":
+            raise InputError("free rows are for the direct formulation; atoms have unit length")
+        for name, value in (("lambda0", self.penalty), ("threshold", self.threshold)):
+            if not 0 <= value < math.inf or (self.formulation == "inverse" and value == 0):
+                raise InputError(f"{name} is {value}, it must be finite and above zero")
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
                 raise InputError(f"{name} is {weight}, it must be finite and not negative")
@@ -107,6 +124,8 @@ class Setting:
                     f"{name} is a weight of the direct formulation; the inverse has coherence only, since "
                     "its atoms have unit length"
                 )
+            if self.formulation == "direct" and self.rows == "unit":
+                raise InputError(f"{name} is a weight for filters of any length; give --rows free with it")
         if self.volumes < 2 or self.iterations < 1 or self.filters < 1:
             raise InputError("at least two volumes, one iteration and one filter are needed to learn")
         entries = self.bins * self.patch * self.patch
@@ -121,7 +140,7 @@ class Setting:
     @property
     def penalty(self) -> float:
         """`lambda0`."""
-        return THRESHOLDS[self.formulation] if self.threshold is None else self.threshold
+        return LAMBDAS[self.formulation, self.rows] if self.lambda0 is None else self.lambda0
 
     @property
     def weights(self) -> dict[str, float]:

@@ -6,7 +6,7 @@ Not here: whitening and learning.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -21,6 +21,15 @@ __all__ = ["KEYS", "Volumes", "Window", "sample_volumes", "windows_of"]
 
 KEYS = 1 << 63
 """Keys are below."""
+
+_PER_WINDOW = 4096
+"""Volumes that one window gives at most: enough to learn from a recording of a second."""
+
+_TRIES = 4
+"""Places that are drawn for a volume until one is not empty."""
+
+_SHOWN = 64
+"""First tries of each window that the share of empty places is told from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +52,8 @@ class Volumes:
     Attributes:
         keys: `(n,)` ascending.
         counts: `(n, d)` clipped counts, bin-major; int8, or int16 where `max_count` asks for it.
-        drawn: places that were drawn.
-        empty: of them, those whose counts were all zero; they were drawn again.
+        drawn: places that were looked at to tell how many are empty, some of each window.
+        empty: of them, those whose counts were all zero.
         windows: how many windows were seen.
     """
 
@@ -80,7 +89,7 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
 
     A labelled sample gives one window, which ends with the sample; samples of a held-out split
     (validation, test) are passed over. Without labels a window begins with the first event that the one
-    before does not reach, wherever packets end.
+    before does not reach, wherever packets end. Where the camera's clock starts anew, so does a window.
 
     Args:
         items: packets and labels in stored order, as `Recording.items` gives them.
@@ -89,7 +98,7 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
     label: Label | None = None
     pending: list[Events] = []
     resolution: Resolution = (0, 0)
-    origin = 0
+    origin = epoch = 0
 
     def window() -> Iterator[Window]:
         if pending and not (label and label.split in HELD_OUT_SPLITS):
@@ -102,9 +111,9 @@ def windows_of(items: Iterable[Packet | Label], geometry: Geometry) -> Iterator[
             yield from window()
             label, origin = item, item.start_us
         elif len(item.events):
-            if item.resolution != resolution:
+            if (item.resolution, item.epoch) != (resolution, epoch):
                 yield from window()
-                resolution = item.resolution
+                resolution, epoch = item.resolution, item.epoch
             rest = item.events
             while label is None and len(rest):
                 first = int(rest["t"][0])
@@ -127,11 +136,12 @@ def sample_volumes(
     seed: Sequence[int],
     *,
     limit: int = KEYS,
-    per_window: int = 64,
+    per_window: int = _PER_WINDOW,
 ) -> Volumes:
     """Draw local volumes at random places, each not empty, with equal chance for every window.
 
-    From each window `per_window` places are kept. What is drawn from a window depends on `seed`, on when it
+    From each window at most `per_window` places are kept, and only those looked at whose keys are small
+    enough to be kept. What is drawn from a window depends on `seed`, on when it
     begins and on how many events it has, and on nothing that was read before.
 
     Args:
@@ -153,6 +163,8 @@ def sample_volumes(
         n_waiting += len(one.keys) + 1
         if n_waiting > max(n_volumes, 4 * per_window):
             kept, waiting, n_waiting = kept.with_others(waiting, n_volumes), [], 0
+            if len(kept.keys) == n_volumes:
+                limit = min(limit, int(kept.keys[-1]))
     return kept.with_others(waiting, n_volumes)
 
 
@@ -163,14 +175,21 @@ def _draw_from(
     rng = np.random.default_rng([*seed, moment, len(window.events)])
     counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
     places = sliding_window_view(counts, (geometry.patch, geometry.patch), axis=(1, 2))
-    n = 4 * per_window
-    rows = rng.integers(0, places.shape[1], n)
-    columns = rng.integers(0, places.shape[2], n)
     keys = rng.integers(0, KEYS, per_window)
-    volumes = places[:, rows, columns].transpose(1, 0, 2, 3).reshape(n, -1)
-    filled = np.flatnonzero(volumes.any(axis=1))
-    n_empty = n - len(filled)
-    filled, keys = filled[:per_window], keys[: len(filled)]
-    below = keys < limit
+    rows = rng.integers(0, places.shape[1], (_TRIES, per_window))
+    columns = rng.integers(0, places.shape[2], (_TRIES, per_window))
+
+    def cut(tried: int, wanted: NDArray[np.int64]) -> NDArray[Any]:
+        found = places[:, rows[tried, wanted], columns[tried, wanted]]
+        return found.transpose(1, 0, 2, 3).reshape(len(wanted), geometry.entries)
+
+    shown = np.arange(min(per_window, _SHOWN))
+    n_empty = int(np.count_nonzero(~cut(0, shown).any(axis=1)))
+    below = np.flatnonzero(keys < limit)
+    volumes = cut(0, below)
+    for tried in range(1, _TRIES):
+        empty = np.flatnonzero(~volumes.any(axis=1))
+        volumes[empty] = cut(tried, below[empty])
+    filled = volumes.any(axis=1)
     kind = np.min_scalar_type(-geometry.max_count)
-    return Volumes(keys[below], volumes[filled[below]].astype(kind), n, n_empty, 1)
+    return Volumes(keys[below[filled]], volumes[filled].astype(kind), len(shown), n_empty, 1)

@@ -1,13 +1,13 @@
 """The state of a live job in a file, so that a program that was killed can go on where it was.
 
-Lives here: what is kept and when, writing it beside the pipeline, reading it back.
-Not here: what the parts keep of themselves (`topic`, `moment`, `engine`).
+Lives here: `Checkpointer`, which takes checkpoints and writes them beside the pipeline; reading them back.
+Not here: what the parts keep of themselves (`topic`, `stream.state`, `engine`).
 
-What is kept must be of one place in the stream. So the intake puts a mark there with what it knows (numbers,
-clocks, decoders); when the mark has come through the queue, the cameras have had all before it and nothing
-after, and add counts and times. What was read until then must have been written before the file says that it
-was: the keeper is the last of the sinks, and waits until it has seen as many readings as were made before
-the mark.
+A checkpoint must be of one place in the stream. So the intake puts a barrier there with what it knows
+(sequence numbers, clocks, decoders); when the barrier has come through the queue, the cameras have had all
+items before it and none after, and their counts and times are added. Emissions made until then must have been
+written before the file says that they were: the checkpointer is the last of the sinks too, and waits until it
+has seen as many emissions as were made before the barrier.
 
 Projections, codes and pooled sums are not kept: they follow from the counts, bit for bit. That makes the file
 small, and leaves a damaged or hostile one nothing to lie about that a kernel would use as an index.
@@ -22,7 +22,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from streamfeat.engine.engine import Snapshot
+from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import sweep
 from streamfeat.files.json_fields import Fields
@@ -46,13 +46,13 @@ _ARRAYS = ("counts", "atoms", "tally", "encoded")
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """What goes into the file.
+    """A checkpoint: what goes into the file.
 
     Attributes:
         saved_ns: when it was taken, since 1970.
         topics: what the intake knows of each.
         cameras: the sessions.
-        made: readings made until then.
+        made: emissions made until then.
     """
 
     saved_ns: int
@@ -69,7 +69,7 @@ class Checkpointer:
         fingerprint: of the encoder.
         health: that processes the items.
         cameras: that it hands them to.
-        intake: whose marks these are.
+        intake: that puts in the barriers.
         on_failure: told why a file could not be written; the file before it stays, and the job goes on.
     """
 
@@ -96,7 +96,7 @@ class Checkpointer:
         self._thread.start()
 
     def process(self, item: StreamItem | CameraLeft | Barrier) -> Iterator[Emission]:
-        """Process an item, or take in the state where there is a mark."""
+        """Process an item, or take a checkpoint at a barrier."""
         if isinstance(item, Barrier):
             self._take(item.topics)
             return
@@ -109,7 +109,7 @@ class Checkpointer:
         self._health.rest()
 
     def finish(self) -> Iterator[Emission]:
-        """Take in the state before the cameras' streams are ended, which is where the next run goes on."""
+        """Take a checkpoint before the cameras' streams are ended, where the next run goes on."""
         self._take(self._intake.snapshot())
         yield from self._health.finish()
 
@@ -134,7 +134,7 @@ class Checkpointer:
 
     def _hand_over(self) -> None:
         if self._taken and self._written >= self._taken.made:
-            # One that was not begun is replaced: a slow disk makes the file older, and nobody wait.
+            # One that still waits is replaced: a slow disk makes the file older, and holds up nothing.
             self._ready, self._taken = self._taken, None
             self._changed.notify()
 
@@ -186,10 +186,10 @@ def read_state(
         fingerprint: of the encoder.
         intake: without a topic yet.
         cameras: without a session yet.
-        shard: what else was kept is another process's by now, and left out.
+        shard: cameras of others, which another process serves by now, are left out.
 
     Raises:
-        InputError: it is not such a file, of another version or another encoder, or holds what no job was in.
+        InputError: it is no such file, of another version or encoder, or holds a state that no job can be in.
     """
     arrays, header = read_safetensors(path, _KIND, _VERSION)
     values = Fields(header, str(path))

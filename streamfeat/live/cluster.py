@@ -1,15 +1,15 @@
 """The main job on live topics, on the workers of a cluster: each camera on one of them.
 
-Lives here: which cameras there are, what runs on a worker, and what all of them have done together.
-Not here: which worker serves a camera, and what takes over when that dies (`cluster`); zenoh brings the data
-straight to the worker.
+Lives here: which cameras there are, what runs on a worker, and the sum of what all workers have done.
+Not here: which worker serves a camera, and which takes over when that dies (`work.services`). zenoh brings
+the data straight to the worker.
 """
 
 import contextlib
 import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names
-from streamfeat.live.network import TopicWatch, open_session
+from streamfeat.live.network import THIS_MACHINE, Network, TopicWatch
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.work.cluster import Cluster
 from streamfeat.work.services import Service, Services
@@ -38,9 +38,9 @@ class ServedCamera:
         starts: how often a worker has begun to serve it.
         past: counts of the workers before.
         now: counts of this one, a quarter of a second old at most.
-        missed: packets that were published between the last that a dead worker told of and the first that the
-            next one heard; some of them the dead one may have read without telling. One that goes on from a
-            state counts them as lost.
+        missed: packets published between the last that a dead worker told of and the first that the next one
+            heard; the dead one may have read some of them without telling. A worker that goes on from a state
+            counts them as lost.
         first_unheard: packets that were published before the first worker heard any.
     """
 
@@ -69,7 +69,7 @@ class ServedCamera:
                 self._close_gap(is_new=not before.get("packets"))
 
     def _close_gap(self, *, is_new: bool) -> None:
-        """Count what nobody has, when a worker hears its first packet."""
+        """Count the packets that no worker has, when one hears its first packet."""
         gap = _reached(self.now) - self._known()
         if not is_new:
             # Since its state was kept, the worker before has read what this one takes for lost.
@@ -101,8 +101,8 @@ class ClusterListen:
         cluster: the workers.
         model: of the encoder.
         classifier: to predict with; none for features alone.
-        zenoh_config: JSON5 file, for this process and the workers; without it, each machine alone.
-        port: where sessions on one machine meet.
+        network: where to listen, in this process and on the workers; without a configuration file, each
+            machine alone.
         state: folder on the workers, best one that all of them see, for what a camera needs to go on after
             its worker died; without it the next worker begins anew, and says what is incomplete.
         say: told about workers, cameras and failures, in lines.
@@ -119,23 +119,21 @@ class ClusterListen:
         model: Path,
         classifier: Path | None = None,
         *,
-        zenoh_config: Path | None = None,
-        port: int,
+        network: Network = THIS_MACHINE,
         state: Path | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
         """Check everything but the network."""
-        given = {"model": model, "classifier": classifier, "zenoh_config": zenoh_config}
-        checked: dict[str, Any] = {**given, "port": port, **options}
-        ListenJob(names, **checked)
+        given = {"model": model, "classifier": classifier, "zenoh": network.config}
+        ListenJob(names, model, classifier, network=network, **options)
         self._names, self._cluster, self._say = names, cluster, say
         # zenoh goes by the ending of the name.
         self._files = {
             name: (f"{name}{path.suffix}", path.read_bytes()) for name, path in given.items() if path
         }
-        self._options = {"port": port, "joins_late": True, **options}
-        self._zenoh_config, self._port, self._state = zenoh_config, port, state
+        self._options = {"joins_late": True, **options}
+        self._network, self._state = network, state
         self._stopped = threading.Event()
         self._lock = threading.Lock()
         self.cameras: dict[str, ServedCamera] = {}
@@ -159,13 +157,19 @@ class ClusterListen:
                 self._say(f"{topic}: not served, {MAX_TOPICS} cameras are")
             else:
                 services.begin(
-                    topic, _serve, self._names.only(topic), self._files, self._options, self._state
+                    topic,
+                    _serve,
+                    self._names.only(topic),
+                    self._files,
+                    self._network,
+                    self._options,
+                    self._state,
                 )
 
         with contextlib.ExitStack() as stack:
             stack.callback(services.end)
             if "*" in self._names.expression:
-                session = stack.enter_context(open_session(self._zenoh_config, port=self._port))
+                session = stack.enter_context(self._network.open())
                 stack.enter_context(TopicWatch(session, self._names, serve))
             else:
                 serve(self._names.expression)
@@ -212,15 +216,17 @@ def _serve(
     service: Service,
     names: Names,
     files: dict[str, tuple[str, bytes]],
+    network: Network,
     options: dict[str, Any],
     state: Path | None,
 ) -> dict[str, Any]:
-    """Listen on one topic on a worker, until nobody wants it any more; what it has done."""
+    """Listen on one topic on a worker until the service ends, and return what was done."""
     with tempfile.TemporaryDirectory(prefix="streamfeat-") as folder:
         given: dict[str, Any] = {**options}
         for argument, (name, content) in files.items():
             given[argument] = Path(folder, name)
             given[argument].write_bytes(content)
+        given["network"] = replace(network, config=given.pop("zenoh", None))
         if state:
             state.mkdir(parents=True, exist_ok=True)
             given["state"] = state / quote(names.expression, safe="")
@@ -232,10 +238,10 @@ def _serve(
 
 
 class _Telling:
-    """Tells what a job has done so far, and stops it when nobody wants it; a context manager."""
+    """Tells what a job has done so far, and stops it when its service ends; a context manager."""
 
     def __init__(self, service: Service, job: ListenJob) -> None:
-        self._errand, self._job = service, job
+        self._service, self._job = service, job
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="telling", daemon=True)
 
@@ -251,7 +257,7 @@ class _Telling:
 
     def _run(self) -> None:
         while not self._over.wait(_TOLD_EVERY_S):
-            if not self._errand.is_wanted():
+            if not self._service.is_wanted():
                 self._job.stop()
                 return
-            self._errand.tell(self._job.result())
+            self._service.tell(self._job.result())

@@ -1,7 +1,7 @@
-"""How a live job is doing: counts for people and for Prometheus.
+"""Figures of a live job: counts for people and for Prometheus.
 
-Lives here: latencies, one view of everything that is counted, and serving it.
-Not here: counting itself, which each part does for its own work.
+Lives here: recent latencies, one list of everything that is counted, and serving it over HTTP.
+Not here: counting, which each part does for its own work.
 """
 
 import time
@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry, Histogram, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from streamfeat.errors import InputError
+from streamfeat.latency.histogram import RecentLatencies
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake, Warnings
 from streamfeat.messages.delivery import DeliveryStats
@@ -26,21 +27,20 @@ from streamfeat.stream.session import StreamItem
 __all__ = ["CameraFigures", "Health", "parse_address"]
 
 _BUCKETS = tuple(scale * base for scale in (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0) for base in (1, 2, 5))
-_KEPT = 65_536
-_SHARES = {"p50": 0.5, "p99": 0.99}
+_PERCENTILES = 50, 99
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """How one camera is doing.
+    """Figures of one camera.
 
     Attributes:
         topic: of the camera.
         events: accepted.
-        emissions: readings made.
+        emissions: emissions made.
         lost: packets that never arrived or were dropped.
-        t_us: stream time of the latest reading; None before the first.
-        prediction: of that reading; None without a classifier.
+        t_us: stream time of the latest emission; None before the first.
+        prediction: of that emission; None without a classifier.
     """
 
     topic: str
@@ -51,41 +51,17 @@ class CameraFigures:
     prediction: str | None
 
 
-class _Latest:
-    """The latest so many values, so that a run of any length has an end."""
-
-    def __init__(self) -> None:
-        self._values: list[float] = []
-        self._n = 0
-
-    def add(self, value: float) -> None:
-        if len(self._values) < _KEPT:
-            self._values.append(value)
-        else:
-            self._values[self._n % _KEPT] = value
-        self._n += 1
-
-    def percentiles(self) -> list[tuple[str, float]]:
-        ordered = sorted(self._values)
-        if not ordered:
-            return []
-        return [
-            (name, ordered[min(int(share * len(ordered)), len(ordered) - 1)])
-            for name, share in _SHARES.items()
-        ]
-
-
 class Health:
     """Counts of one live job; a processor too, which times the cameras it wraps.
 
     Args:
-        cameras: what is done with events.
-        intake: what was received.
-        inbox: what waits.
-        warnings: what was refused.
+        cameras: that process the items.
+        intake: that received them.
+        inbox: where messages wait.
+        warnings: that were given.
 
     Attributes:
-        queues: tells how full the queues of the pipeline are.
+        queues: gives the depth of the pipeline's queues.
     """
 
     def __init__(self, cameras: Cameras, intake: Intake, inbox: Inbox, warnings: Warnings) -> None:
@@ -100,7 +76,7 @@ class Health:
         self.registry = CollectorRegistry()
         self._update = Histogram(
             "streamfeat_update_latency_seconds",
-            "From a packet's turn to its last reading",
+            "From a packet's turn to its last emission",
             registry=self.registry,
             buckets=_BUCKETS,
         )
@@ -110,24 +86,24 @@ class Health:
             registry=self.registry,
             buckets=_BUCKETS,
         )
-        self._latest_update, self._latest_end_to_end = _Latest(), _Latest()
+        self._recent_updates, self._recent_end_to_end = RecentLatencies(), RecentLatencies()
         self._latest: dict[str, Emission] = {}
         self.registry.register(self)
 
     def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
-        """Process an item with the cameras; only what they take of the clock is counted."""
+        """Process an item with the cameras; the time that sinks take in between is not counted."""
         spent = 0.0
-        readings = self._cameras.process(item)
+        emissions = self._cameras.process(item)
         while True:
             started = time.perf_counter()
-            emission = next(readings, None)
+            emission = next(emissions, None)
             spent += time.perf_counter() - started
             if emission is None:
                 break
             self._latest[emission.topic] = emission
             yield emission
         self._update.observe(spent)
-        self._latest_update.add(spent)
+        self._recent_updates.add(1e9 * spent)
         if isinstance(item, CameraLeft):
             self._latest.pop(item.topic, None)
 
@@ -144,7 +120,7 @@ class Health:
         if source_ns:
             seconds = (now_ns - source_ns) / 1e9
             self._end_to_end.observe(seconds)
-            self._latest_end_to_end.add(seconds)
+            self._recent_end_to_end.add(now_ns - source_ns)
 
     def serve(self, host: str, port: int) -> int:
         """Serve the metrics over HTTP in a thread of its own; gives the port.
@@ -175,21 +151,21 @@ class Health:
             ("events", stats.events, "Events accepted"),
             ("late_events", stats.late, "Events older than the window"),
             ("rejected_events", stats.rejected, "Events outside the sensor or malformed"),
-            ("emissions", stats.emissions, "Readings of features"),
-            ("incomplete_emissions", stats.incomplete, "Readings of windows that packets are missing from"),
+            ("emissions", stats.emissions, "Emissions of features"),
+            ("incomplete_emissions", stats.incomplete, "Emissions of windows that packets are missing from"),
             ("packets", delivery.received, "Packets used"),
-            ("lost_packets", delivery.lost, "Packets that never arrived: gaps in their numbers"),
-            ("unheard_packets", delivery.unheard, "Numbers before the first packet of a camera"),
+            ("lost_packets", delivery.lost, "Packets that never arrived: gaps in their sequence numbers"),
+            ("unheard_packets", delivery.unheard, "Sequence numbers before the first packet of a camera"),
             ("dropped_packets", self._inbox.dropped, "Packets dropped because ingest could not keep up"),
             ("duplicate_packets", delivery.duplicates, "Packets that had arrived before"),
             ("reordered_packets", delivery.reordered, "Packets that arrived late"),
             ("foreign_packets", delivery.foreign, "Packets of a second publisher on the same key"),
-            ("publisher_restarts", delivery.restarts, "Publishers that took over or counted anew"),
+            ("publisher_restarts", delivery.restarts, "Publishers that took over or began to count anew"),
             *self._left(),
         ]
 
     def _left(self) -> list[tuple[str, int, str]]:
-        """Who hears no camera sees here whether there are any; without `--shard` there is nothing to see."""
+        """Packets of other shards: a sign of life for a shard without cameras; only with `--shard`."""
         left = self._inbox.left
         return [("other_shards_packets", left, "Packets of cameras of other shards")] if left else []
 
@@ -205,8 +181,8 @@ class Health:
     def latencies(self) -> list[tuple[str, list[tuple[str, float]]]]:
         """Seconds at some percentiles, of the latest updates and of the latest published features."""
         return [
-            ("update", self._latest_update.percentiles()),
-            ("end to end", self._latest_end_to_end.percentiles()),
+            ("update", self._recent_updates.percentiles(*_PERCENTILES)),
+            ("end to end", self._recent_end_to_end.percentiles(*_PERCENTILES)),
         ]
 
     def cameras(self) -> list[CameraFigures]:
@@ -224,18 +200,20 @@ class Health:
         """Everything that is counted elsewhere, for Prometheus."""
         for name, value, text in self.figures():
             yield CounterMetricFamily(f"streamfeat_{name}", text, value=value)
-        refused = CounterMetricFamily("streamfeat_warnings", "What was refused or strange", labels=["reason"])
+        refused = CounterMetricFamily(
+            "streamfeat_warnings", "Messages that were refused, and events worth a warning", labels=["reason"]
+        )
         for reason, count in sorted(self.reasons().items()):
             refused.add_metric([reason], count)
         yield refused
-        depth = GaugeMetricFamily("streamfeat_queue_depth", "What waits in each queue", labels=["queue"])
+        depth = GaugeMetricFamily("streamfeat_queue_depth", "Items that wait in each queue", labels=["queue"])
         for name, waiting in self.depths():
             depth.add_metric([name], waiting)
         yield depth
         yield GaugeMetricFamily("streamfeat_cameras", "Cameras served", value=len(self._cameras.topics))
 
     def drops(self) -> dict[str, int]:
-        """What was not used, or was strange, by reason: packets, and (`late`, `rejected`) events."""
+        """Packets, and (`late`, `rejected`) events, that were not used or are worth a warning, by reason."""
         stats, delivery = self._cameras.stats(), self.delivery()
         return {
             "lost": delivery.lost,
@@ -268,12 +246,12 @@ class Health:
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         result |= self.drops() | {"warnings": dict(sorted(self.reasons().items()))}
         result |= {name: left for name, left, _ in self._left()}
-        for name, seconds in self._latest_end_to_end.percentiles():
+        for name, seconds in self._recent_end_to_end.percentiles(*_PERCENTILES):
             result[f"end_to_end_{name}_ms"] = round(1e3 * seconds, 3)
         return result
 
     def reasons(self) -> Counter[str]:
-        """What was refused or strange, by reason."""
+        """Messages that were refused, and events worth a warning, by reason."""
         return Counter(dict(list(self._warnings.counts.items())))
 
 
@@ -281,7 +259,7 @@ def parse_address(text: str) -> tuple[str, int]:
     """Read `HOST:PORT`.
 
     Raises:
-        InputError: the text is none.
+        InputError: the text is something else.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:

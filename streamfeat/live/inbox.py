@@ -19,6 +19,10 @@ _MAX_BYTES = 64 << 20
 _OVERHEAD = 512
 """What a message costs besides its payload, so that their number is bounded too: 131,072 empty ones."""
 _TAKEN_AT_ONCE = 64
+_MAX_ANNOUNCEMENTS = 4096
+"""Announcements that may wait; further ones are refused and counted."""
+_MAX_NAMED = 4096
+"""Topics whose drops are remembered one by one; those of further topics are in the total alone."""
 
 
 @dataclass(slots=True)
@@ -64,6 +68,7 @@ class Inbox:
     Attributes:
         dropped: messages dropped so far.
         left: messages left to other processes.
+        refused: announcements that were not taken in, because too many waited.
     """
 
     def __init__(self, max_bytes: int = _MAX_BYTES, max_delay_s: float = math.inf) -> None:
@@ -75,7 +80,8 @@ class Inbox:
         self._dropped: Counter[str] = Counter()
         self._changed = threading.Condition()
         self._closed = False
-        self.dropped = self.left = 0
+        self._announcements = 0
+        self.dropped = self.left = self.refused = 0
 
     @property
     def depth(self) -> int:
@@ -87,11 +93,21 @@ class Inbox:
         with self._changed:
             if self._closed:
                 return
+            if isinstance(item, Announcement):
+                if self._announcements >= _MAX_ANNOUNCEMENTS:
+                    self.refused += 1
+                    return
+                self._announcements += 1
             self._items.append(item)
             if isinstance(item, RawMessage):
                 self._bytes += len(item.payload) + _OVERHEAD
                 self._drop_oldest(item.arrived_ns - self._max_delay_ns)
             self._changed.notify()
+
+    def refuse(self) -> None:
+        """Count an announcement that was not worth putting in."""
+        with self._changed:
+            self.refused += 1
 
     def leave(self) -> None:
         """Count a message that is another process's to take."""
@@ -104,7 +120,8 @@ class Inbox:
             oldest = self._items.popleft()
             if isinstance(oldest, RawMessage):
                 self._bytes -= len(oldest.payload) + _OVERHEAD
-                self._dropped[oldest.topic] += 1
+                if oldest.topic in self._dropped or len(self._dropped) < _MAX_NAMED:
+                    self._dropped[oldest.topic] += 1
                 self.dropped += 1
             else:
                 kept.append(oldest)
@@ -132,6 +149,8 @@ class Inbox:
                 if isinstance(item, RawMessage):
                     self._bytes -= len(item.payload) + _OVERHEAD
                     item.dropped = self._dropped.pop(item.topic, 0)
+                elif isinstance(item, Announcement):
+                    self._announcements -= 1
             return taken
 
     def close(self) -> None:

@@ -151,10 +151,15 @@ class Intake:
     def __iter__(self) -> Iterator[Packet | Label | Watermark | CameraLeft | Barrier | None]:
         """Yield items as they come; None when nothing more is there at the moment."""
         looked = marked = time.monotonic()
-        is_new = False
+        is_new, refused = False, 0
         while (taken := self._inbox.take(_POLL_S if self.topics else _IDLE_S)) is not None:
             for message in taken:
                 yield from self._items(message)
+            if self._inbox.refused > refused:
+                more, refused = self._inbox.refused - refused, self._inbox.refused
+                self._warnings.add(
+                    "announcements refused", "the network", f"{more} more than can be followed"
+                )
             now = time.monotonic()
             is_new |= bool(taken)
             if is_new and now >= marked + self._mark_s:

@@ -1,51 +1,54 @@
-"""The main job on live topics: events in, features and predictions out, until somebody stops it.
+"""The main job on live topics: events in, features and predictions out, until it is stopped.
 
 Lives here: putting together what listening needs, and ending well.
-Not here: each of the parts.
+Not here: the parts themselves.
 """
 
 import math
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
 
-from streamfeat.classify.classifier import Classifier
-from streamfeat.engine.encoder import Encoder
+from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
-from streamfeat.events import make_events
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import SILENCE_S, Intake, Warnings
-from streamfeat.live.names import Names, beside
-from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.names import Names, PlainNames, RosNames, beside
+from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import OutputSink
 from streamfeat.live.screen import HealthTable
 from streamfeat.live.shard import Shard
+from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import Barrier
-from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
-from streamfeat.messages.packets import Packet
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, Processor, run_until_interrupted, signals_wait
+from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
+from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
+from streamfeat.stream.pipeline import Pipeline, Processor
 from streamfeat.stream.session import Session, StreamItem
-from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
-from streamfeat.stream.table import TableSink
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
+from streamfeat.stream.sinks import RecordingSink, Sink
+from streamfeat.stream.state import SessionStats
+from streamfeat.stream.warming import warm_up
 
-__all__ = ["ListenJob"]
+__all__ = ["ListenJob", "listen"]
 
 PATIENCE_S = 0.05
-"""A packet that has waited longer is read as `auto` would, so that those behind it need not wait."""
+"""Behind a packet that has waited longer, a session emits as `auto` does, until it has caught up."""
 MAX_DELAY_S = 1.0
-"""Where even feeding cannot keep up, packets are dropped rather than being ever further behind."""
+"""Where even feeding cannot keep up, packets are dropped, so that the delay does not grow."""
 _DRAWN_A_SECOND = 4
 
 
@@ -54,25 +57,27 @@ class ListenJob:
 
     Args:
         names: of the topics.
-        model: of the encoder.
-        classifier: to predict with; none for features alone.
-        emit: when to read, see `EmitPolicy.parse`.
+        model: path of the encoder, or the encoder.
+        classifier: path of one to predict with, or the classifier; features alone without it.
+        emit: when to emit, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
-        reliable: recover missed packets and ask for history, from publishers that do the same.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
+        denoising: noise of each camera that is taken out before anything is counted.
+        network: where to listen; `reliable` recovers missed packets and asks for history, from publishers
+            that do the same.
+        publish: put features and predictions on the network, beside the events.
         metrics: `HOST:PORT` to serve Prometheus metrics on.
         silence_s: how long a camera must be silent before its time goes on without it.
-        patience_s: how long packets may wait before readings are left out for them.
+        patience_s: how long packets may wait before emissions are left out for them.
         max_delay_s: how long packets may wait before the oldest are dropped.
         state: file to keep what is needed to go on after a crash; gone on from, if it exists.
         state_every_s: how often it is written.
-        shard: the share of the cameras to serve; all without it.
-        announced: serve those only that announce themselves; what others publish is not asked for.
-        joins_late: readings are incomplete until a window has passed, if packets were published before; as
-            of one who goes on with the cameras of another.
+        shard: the share of the cameras to serve; all of them without it.
+        announced: serve only cameras that announce themselves, and ask for nothing else.
+        joins_late: emissions are incomplete until a window has passed, if packets were published before;
+            for a job that goes on with the cameras of another.
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
+        tap: what items pass through before anything is computed from them.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -81,14 +86,14 @@ class ListenJob:
     def __init__(
         self,
         names: Names,
-        model: Path,
-        classifier: Path | None = None,
+        model: ModelSource,
+        classifier: ClassifierSource | None = None,
         *,
-        emit: str = "auto",
+        emit: str | EmitPolicy = "auto",
         learn_online: bool = False,
-        reliable: bool = False,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
+        denoising: Denoising | None = None,
+        network: Network = THIS_MACHINE,
+        publish: bool = True,
         metrics: str | None = None,
         silence_s: float = SILENCE_S,
         patience_s: float = PATIENCE_S,
@@ -100,22 +105,26 @@ class ListenJob:
         joins_late: bool = False,
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
+        tap: Callable[[Iterable[Any]], Iterable[Any]] = lambda items: items,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
-        self._policy = EmitPolicy.parse(emit)
-        self._encoder = Encoder.load(model)
-        self._classifier = Classifier.load(classifier) if classifier else None
-        if self._classifier:
-            self._classifier.check_fits(self._encoder, path=classifier or "the classifier")
-        elif learn_online:
+        self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+        limits = {"delay": max_delay_s, "silence": silence_s, "patience": patience_s}
+        for name, seconds in limits.items():
+            if not seconds >= 0:
+                raise InputError(f"a {name} of {seconds} s is not possible; give a number from 0 on")
+        self._encoder, self._classifier = open_models(model, classifier)
+        if learn_online and self._classifier is None:
             raise InputError("--learn-online needs a classifier to start from; give one with -c")
         if state and learn_online:
             raise InputError("--state does not keep what --learn-online learns; give one of the two")
+        if state and denoising:
+            raise InputError("--state does not keep what is known of noisy pixels; give one of the two")
+        self._denoising = denoising
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
-        self._learn_online, self._reliable = learn_online, reliable
-        self._engine_of = engine_of
-        self._zenoh_config, self._port = zenoh_config, port
+        self._learn_online, self._network, self._publish = learn_online, network, publish
+        self._engine_of, self._tap = engine_of, tap
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
         self._warnings = Warnings.on(console)
@@ -130,79 +139,71 @@ class ListenJob:
         if state and state.exists():
             read_state(state, self._encoder.fingerprint, self._intake, self._cameras, shard)
 
-    def run(
-        self,
-        *,
-        console: Console | None = None,
-        every_sample: bool = False,
-        recording_out: Path | None = None,
-        json_lines: Path | TextIO | None = None,
-        with_features: bool = False,
-        table: Path | None = None,
-        more: Sink[Emission] | None = None,
-        publish: bool = True,
-    ) -> None:
-        """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
+    @contextmanager
+    def opened(self, sinks: Callable[[], Sequence[Sink[Emission]]]) -> Iterator[Pipeline[Any, Emission]]:
+        """The pipeline of this job into some sinks, with network and metrics open as long as the block runs.
 
         Args:
-            console: for a table that is kept up to date if it is a terminal, or else for lines.
-            every_sample: a line for each labelled sample, however fast they come; no table then.
-            recording_out: MCAP file for features and predictions; replaced if it exists.
-            json_lines: file (replaced) or open stream for a JSON line for each emission.
-            with_features: include features in JSON lines.
-            table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
-            more: one sink more.
-            publish: put features and predictions on the network, beside the events.
+            sinks: opens them, when all else is open.
 
         Raises:
             InputError: an output, the network or the metrics address cannot be used.
         """
-        self._warm_up()
-        is_screen = console is not None and console.is_terminal and not every_sample
-        labels = self._classifier.labels if self._classifier else ()
-        screen = Live(
-            get_renderable=lambda: HealthTable(self.health),
-            console=console,
-            refresh_per_second=_DRAWN_A_SECOND,
-            transient=True,
-        )
-        with (
-            open_session(self._zenoh_config, port=self._port) as session,
-            screen if is_screen else nullcontext(),
-            signals_wait(),
-        ):
-            sinks = open_sinks(
-                partial(OutputSink, session, self._names, self.health.on_published) if publish else None,
-                partial(TerminalSink, console, every_sample=every_sample)
-                if console and not is_screen
-                else None,
-                partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
-                partial(_recording_sink, recording_out) if recording_out else None,
-                partial(TableSink, table, self._encoder.n_features, labels) if table else None,
-                (lambda: more) if more else None,
-                self._keeper if self._state else None,
+        warm_up(self._encoder, self._policy, decoders=True)
+        with ExitStack() as opened:
+            session = opened.enter_context(self._network.open())
+            if self._address:
+                opened.callback(self.health.stop_serving)
+                self.health.serve(*self._address)
+            heard = Subscription(
+                session,
+                self._names,
+                self._inbox,
+                reliable=self._network.reliable,
+                shard=self._shard,
+                announced=self._announced,
             )
-            processor: Processor[Any, Emission] = (
-                sinks[-1] if isinstance(sinks[-1], Checkpointer) else self.health
-            )
+            opened.enter_context(heard)
+            processor: Processor[Any, Emission] = self.health
+            checkpointed: list[Sink[Emission]] = []
+            published: list[Sink[Emission]] = []
+            if self._publish:
+                published = [OutputSink(session, self._names, self.health.on_published)]
+            written = sinks()
+            if self._state:
+                # Last of the sinks: what it keeps says that all others have written.
+                processor = checkpointer = self._checkpointer(self._state)
+                checkpointed = [checkpointer]
             pipeline: Pipeline[StreamItem | CameraLeft | Barrier, Emission] = Pipeline(
-                self._intake, processor, sinks
+                self._tap(self._intake), processor, [*published, *written, *checkpointed]
             )
             self.health.queues = pipeline.stats
-            try:
-                if self._address:
-                    self.health.serve(*self._address)
-                with Subscription(
-                    session,
-                    self._names,
-                    self._inbox,
-                    reliable=self._reliable,
-                    shard=self._shard,
-                    announced=self._announced,
-                ):
-                    self.interrupted = run_until_interrupted([pipeline], self.stop)
-            finally:
-                self.health.stop_serving()
+            yield pipeline
+
+    def run(self, outputs: Outputs = NO_OUTPUTS) -> None:
+        """Listen until `stop`, SIGINT or SIGTERM; what has arrived by then is still processed and written.
+
+        Args:
+            outputs: where emissions go. A console that is a terminal shows a table that is kept up to date,
+                unless every sample is to have a line.
+
+        Raises:
+            InputError: an output, the network or the metrics address cannot be used.
+        """
+        console = outputs.console
+        labels = self._classifier.labels if self._classifier else ()
+        with ExitStack() as held:
+
+            def sinks() -> Sequence[Sink[Emission]]:
+                lines = outputs
+                if console and console.is_terminal and not outputs.every_sample:
+                    held.enter_context(_screen(self.health, console))
+                    lines = replace(outputs, console=None)
+                held.enter_context(signals_wait())
+                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+
+            with self.opened(sinks) as pipeline:
+                self.interrupted = run_until_interrupted([pipeline], self.stop)
 
     def stop(self) -> None:
         """Take in no more; may be called from any thread."""
@@ -212,33 +213,15 @@ class ListenJob:
         """What happened, as JSON values."""
         return self.health.result() | {"interrupted": self.interrupted}
 
-    def _warm_up(self) -> None:
-        """Compile what the first packets would otherwise have to wait for."""
-        geometry = self._encoder.geometry
-        side = geometry.patch * geometry.downsample
-        event = make_events([0], [0], [1], [0])
-        for encoding in PAYLOAD_ENCODINGS:
-            payload, base_ns = encode(event, encoding)
-            make_decoder(encoding).decode(payload, base_ns)
-        # In time and too late, however long compiling takes: the two ways to feed.
-        for is_late in (False, True):
-            session = self._make_session("", Engine, lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
-            for _ in session.process(Packet("", event, (side, side), 0, 0)):
-                pass
-            session.rest()
-            for _ in session.finish():
-                pass
-
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         return self.health.drops()
 
-    def _make_session(
-        self,
-        topic: str,
-        engine: Callable[..., Engine] | None = None,
-        is_behind: Callable[[int], bool] | None = None,
-    ) -> Session:
+    def session_stats(self) -> SessionStats:
+        """Totals of all cameras so far; may be called from another thread."""
+        return self._cameras.stats()
+
+    def _make_session(self, topic: str) -> Session:
         return Session(
             self._encoder,
             self._policy,
@@ -246,18 +229,19 @@ class ListenJob:
             learn_online=self._learn_online,
             clock=time.perf_counter,
             topic=topic,
-            is_behind=is_behind or self._is_behind,
-            engine=engine or self._engine_of(topic),
+            is_behind=self._is_behind,
+            engine=self._engine_of(topic),
+            denoising=self._denoising,
         )
 
-    def _keeper(self) -> Checkpointer:
-        assert self._state
-        parts = self.health, self._cameras, self._intake
+    def _checkpointer(self, path: Path) -> Checkpointer:
         return Checkpointer(
-            self._state,
+            path,
             self._encoder.fingerprint,
-            *parts,
-            lambda error: self._warnings.add("state not kept", str(self._state), error),
+            self.health,
+            self._cameras,
+            self._intake,
+            lambda error: self._warnings.add("state not kept", str(path), error),
         )
 
     def _is_behind(self, log_time_ns: int) -> bool:
@@ -267,6 +251,81 @@ class ListenJob:
         self._warnings.add(reason, topic, error)
 
 
+def _screen(health: Health, console: Console) -> Live:
+    return Live(
+        get_renderable=lambda: HealthTable(health),
+        console=console,
+        refresh_per_second=_DRAWN_A_SECOND,
+        transient=True,
+    )
+
+
 def _recording_sink(path: Path) -> RecordingSink:
     writer = RecordingWriter(path, overwrite=True, keep_partial=True, compression="lz4")
     return RecordingSink(writer, lambda topic, kind: "/" + beside(topic, kind).lstrip("/"))
+
+
+def listen(
+    topics: str,
+    model: ModelSource,
+    classifier: ClassifierSource | None = None,
+    *,
+    emit: str | EmitPolicy = "auto",
+    ros_domain: int = 0,
+    learn_online: bool = False,
+    max_delay_s: float = MAX_DELAY_S,
+    port: int = THIS_MACHINE.port,
+    zenoh_config: str | PathLike[str] | None = None,
+    reliable: bool = False,
+    publish: bool = False,
+) -> EmissionStream:
+    """Listen to live topics as an asynchronous iterator of emissions, those that `streamfeat listen` makes.
+
+    It goes on until `stop`, `aclose`, or the loop is left. A program that takes emissions too slowly makes
+    the job emit less often; packets that wait for more than `max_delay_s` are dropped and counted.
+
+    Example:
+        >>> async def main():
+        ...     async with sf.listen("robot/*/events", "model", "classifier") as emissions:
+        ...         async for emission in emissions:
+        ...             print(emission.topic, emission.prediction, emissions.stats().drops)
+        >>> asyncio.run(main())  # in Jupyter: await main()
+
+    Args:
+        topics: zenoh key expression, such as `robot/*/events`; or a ROS 2 topic (rmw_zenoh), with its slash
+            in front.
+        model: path of the encoder, or the encoder.
+        classifier: path of a classifier, or the classifier; features alone without it.
+        emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
+        ros_domain: ROS_DOMAIN_ID, of a ROS 2 topic.
+        learn_online: learn from labels that are published beside the events.
+        max_delay_s: how long packets may wait before the oldest are dropped.
+        port: where sessions on this machine meet.
+        zenoh_config: JSON5 configuration of zenoh; without it, this machine alone.
+        reliable: recover missed packets, from publishers that do the same.
+        publish: publish features and predictions beside the events, too.
+
+    Returns:
+        the stream; nothing is opened before it is used. Iterating raises InputError where a file or the
+        network cannot be used.
+
+    Raises:
+        InputError: a topic, `emit` or `port` makes no sense.
+    """
+    names: Names = RosNames(topics, ros_domain) if topics.startswith("/") else PlainNames(topics)
+    policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+    network = Network(Path(zenoh_config) if zenoh_config else None, port, reliable)
+
+    def make_job() -> ListenJob:
+        return ListenJob(
+            names,
+            model,
+            classifier,
+            emit=policy,
+            learn_online=learn_online,
+            max_delay_s=max_delay_s,
+            network=network,
+            publish=publish,
+        )
+
+    return EmissionStream(make_job)

@@ -1,4 +1,4 @@
-"""What things are called on a zenoh network, plain or as ROS 2 calls them, and what goes with each message.
+"""Names on a zenoh network, plain or of ROS 2, and the attachment of each message.
 
 Lives here: key expressions, liveliness tokens, type names and hashes, attachments, encodings.
 Not here: sessions and messages in flight (`network`, `publisher`).
@@ -103,11 +103,11 @@ def beside(topic: str, kind: str) -> str:
 
 
 class Names(Protocol):
-    """How topics are called on the network."""
+    """The names of topics on the network."""
 
     @property
     def expression(self) -> str:
-        """What the topics are called, perhaps with wildcards."""
+        """The topics, perhaps with wildcards."""
 
     @property
     def subscriptions(self) -> list[str]:
@@ -118,7 +118,7 @@ class Names(Protocol):
         """Key expression of the liveliness tokens of event publishers."""
 
     def schema(self, key: str, encoding: str) -> str | None:
-        """The type of a message, or None if it can be none of ours."""
+        """The type of a message, or None if it is no type that is read here."""
 
     def topic(self, key: str) -> str:
         """The topic of a message, as it is shown."""
@@ -138,6 +138,21 @@ class PlainNames:
     """Plain zenoh: a topic is a key."""
 
     expression: str
+
+    def __post_init__(self) -> None:
+        """Check the argument.
+
+        Raises:
+            InputError: it begins or ends with a slash, or is empty, as no key is.
+        """
+        bare = self.expression.strip("/")
+        if not bare:
+            raise InputError(f"{self.expression!r} is no zenoh key; give one such as robot/cam0/events")
+        if bare != self.expression:
+            raise InputError(
+                f"{self.expression!r} is no zenoh key, for those have no slash at either end; give {bare!r}, "
+                "or --ros2 for a ROS 2 topic"
+            )
 
     @property
     def subscriptions(self) -> list[str]:
@@ -242,7 +257,7 @@ def ros_type(schema: str) -> str:
 
 
 def schema_of_ros(name: str) -> str | None:
-    """The other way; None for a type that we do not read."""
+    """The schema of a DDS type name; None for a type that is not read here."""
     known = {ros_type(schema): schema for schema in (*EVENT_SCHEMAS, LabelMessage.SCHEMA_NAME)}
     return known.get(name)
 
@@ -259,5 +274,5 @@ def ros_entity_token(
 
 
 def gid_of(token: str) -> bytes:
-    """16 bytes that stand for the publisher with this token."""
+    """16 bytes that identify the publisher with this token."""
     return blake2b(token.encode(), digest_size=16).digest()

@@ -1,14 +1,13 @@
 """Recordings as live cameras.
 
 Lives here: one or several recordings played to topics, at their pace or another, once or for ever.
-Not here: reading (`recording`), pacing (`pipeline`), the network (`network`, `publisher`).
+Not here: reading (`recordings`), pacing (`stream.pacing`), the network (`network`, `publisher`).
 """
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -16,12 +15,14 @@ import zenoh
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.live.names import Names
-from streamfeat.live.network import DEFAULT_PORT, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import CameraSink
 from streamfeat.messages.cdr import EventPacket, LabelMessage
 from streamfeat.messages.packets import Label, Packet, PacketWriter
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import open_recording
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.signals import run_until_interrupted
 from streamfeat.stream.sinks import open_sinks
 
 __all__ = ["PublishJob"]
@@ -34,14 +35,14 @@ class PublishJob:
 
     Args:
         sources: recordings, with the topic of each.
-        names: how topics are called.
-        speed: stream seconds for each second of the clock; None for as fast as readers take it.
+        names: plain or ROS 2.
+        topic: event topic of the recordings, where they have several.
+        reading: how to read the recordings.
+        speed: stream seconds for each second of the clock; None for as fast as subscribers take them.
         loop: start again at the end, with times that go on.
         encoding: of the payloads.
-        reliable: keep packets for readers that missed them.
-        wait_s: how long to wait for somebody to subscribe.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
+        wait_s: how long to wait for a subscriber.
+        network: where to publish; `reliable` keeps packets for readers that missed them.
 
     Raises:
         InputError: a recording cannot be read, or an argument makes no sense.
@@ -52,25 +53,29 @@ class PublishJob:
         sources: list[tuple[Location, str]],
         names: Names,
         *,
+        topic: str | None = None,
+        reading: ReadOptions = AS_IT_IS,
         speed: float | None = 1.0,
         loop: bool = False,
         encoding: str = "mono",
-        reliable: bool = False,
         wait_s: float = 1.0,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
+        network: Network = THIS_MACHINE,
     ) -> None:
         """Check the arguments."""
+        if not 0 <= wait_s < 1e9:
+            raise InputError(f"--wait {wait_s}: give seconds from 0 on")
         topics = [topic for _, topic in sources]
         if len(set(topics)) < len(topics) or any("*" in topic for topic in topics):
             raise InputError(f"each recording needs a topic of its own, without wildcards, not {topics}")
+        self.assumptions: list[str] = []
         for path, _ in sources:
-            open_recording(path).close()
+            with open_recording(path, topic, reading) as recording:
+                self.assumptions += recording.assumptions
         PacketWriter(encoding)
         self._sources, self._names = sources, names
+        self._topic, self._reading = topic, reading
         self._speed, self._loop, self._encoding = speed, loop, encoding
-        self._reliable, self._wait_s = reliable, wait_s
-        self._zenoh_config, self._port = zenoh_config, port
+        self._wait_s, self._network = wait_s, network
         self._cutters: list[_Cutter] = []
         self._sinks: list[CameraSink] = []
         self._seconds = 0.0
@@ -85,9 +90,9 @@ class PublishJob:
             report: called with (step, done, of how many, remark) as packets and labels are read, from a
                 thread.
         """
-        # Only those without a pace of their own can wait for readers; a camera cannot.
-        options = {"block": self._speed is None, "reliable": self._reliable}
-        with open_session(self._zenoh_config, port=self._port) as session, ExitStack() as recordings:
+        # Only a publisher without a pace can wait for subscribers; a camera cannot.
+        options = {"block": self._speed is None, "reliable": self._network.reliable}
+        with self._network.open() as session, ExitStack() as recordings:
             self._sinks = open_sinks(
                 *(partial(CameraSink, session, self._names, topic, **options) for _, topic in self._sources)
             )
@@ -95,7 +100,7 @@ class PublishJob:
             pipelines: list[Pipeline[Packet | Label, EventPacket | LabelMessage]] = []
             for (path, topic), cutter, sink in zip(self._sources, self._cutters, self._sinks, strict=True):
                 _wait_for_readers(session, self._names.key(topic, EventPacket.SCHEMA_NAME), self._wait_s)
-                items = recordings.enter_context(open_recording(path)).played(
+                items = recordings.enter_context(open_recording(path, self._topic, self._reading)).played(
                     loop=self._loop,
                     report=lambda n, total, topic=topic: report(f"publishing {topic}", n, total, ""),  # type: ignore[misc]
                 )
@@ -123,10 +128,14 @@ class _Cutter:
 
     def __init__(self, encoding: str) -> None:
         self._writer = PacketWriter(encoding)
+        self._epoch = 0
         self.events = 0
 
     def process(self, item: Packet | Label) -> Iterator[EventPacket | LabelMessage]:
         if isinstance(item, Packet):
+            if item.epoch != self._epoch:
+                self._epoch = item.epoch
+                self._writer.restart()
             yield from self._writer.messages(item.events, item.resolution)
             self.events += len(item.events)
         else:

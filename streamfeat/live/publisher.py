@@ -1,7 +1,7 @@
-"""Publishing on a zenoh network: events as a camera does, and what was seen in them.
+"""Publishing on a zenoh network: events as a camera does, and features and predictions of them.
 
 Lives here: numbered messages with attachments, announced by liveliness tokens; the sinks that write them.
-Not here: names and attachments (`names`), what is published (`session`, `recording`).
+Not here: names and attachments (`names`), what is published (`stream`, `recordings`).
 """
 
 import os
@@ -23,6 +23,7 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
+from streamfeat.live.network import first_line
 from streamfeat.messages.cdr import EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.stream.cameras import MAX_CAMERAS
 from streamfeat.stream.emission import Emission
@@ -30,7 +31,7 @@ from streamfeat.stream.emission import Emission
 __all__ = ["CameraSink", "MessagePublisher", "OutputSink"]
 
 _CACHED = 256
-"""Messages that a reliable publisher keeps for those who missed them."""
+"""Messages that a reliable publisher keeps for subscribers that missed them."""
 _HEARTBEAT_S = 0.1
 _FIRST_ENTITY = 10
 
@@ -40,11 +41,12 @@ class MessagePublisher:
 
     Args:
         session: open; not closed here.
-        names: how the topic is called.
-        topic: where.
+        names: plain or ROS 2.
+        topic: to publish on.
         schema: type of the messages.
-        block: wait when the network is slower than we are; otherwise zenoh drops, and readers see the gap.
-        reliable: keep messages for readers that missed them, see `Subscription`.
+        block: wait when the network is slower than this program; otherwise zenoh drops messages, and
+            subscribers see the gap.
+        reliable: keep messages for subscribers that missed them, see `Subscription`.
         entity: number of this publisher within the session, for ROS 2.
     """
 
@@ -92,7 +94,7 @@ class MessagePublisher:
             self._open += [session.liveliness().declare_token(token) for token in tokens]
         except zenoh.ZError as error:
             self.close()
-            raise InputError(f"{key!r} cannot be published on: {str(error).splitlines()[0][:200]}") from None
+            raise InputError(f"{key!r} cannot be published on: {first_line(error)}") from None
 
     def put(self, data: bytes) -> None:
         """Publish one message."""
@@ -126,7 +128,7 @@ class OutputSink:
 
     Args:
         session: open; not closed here.
-        names: how the sources are called.
+        names: plain or ROS 2.
         on_published: given `source_ns` of the emission and the time now, both since 1970.
     """
 
@@ -136,7 +138,7 @@ class OutputSink:
         names: Names,
         on_published: Callable[[int, int], None] = lambda source_ns, now_ns: None,
     ) -> None:
-        """Declare nothing before there is something to publish."""
+        """Nothing is declared before there is something to publish."""
         self._session = session
         self._names = names
         self._on_published = on_published
@@ -177,7 +179,7 @@ class CameraSink:
 
     Args:
         session: open; not closed here.
-        names: how the topic is called.
+        names: plain or ROS 2.
         topic: of the events; labels go beside it.
         block: see `MessagePublisher`.
         reliable: see `MessagePublisher`.

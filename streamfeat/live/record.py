@@ -1,10 +1,10 @@
 """Live topics to a recording that survives a crash.
 
-Lives here: which messages are recorded, and how often they are made safe.
-Not here: writing (`recorder`), the network (`network`).
+Lives here: which messages are recorded, and how often chunks are closed.
+Not here: writing (`recordings.writer`), the network (`network`, `subscription`).
 
 Messages are written as they came. Every `chunk_s` seconds what was written is closed as a chunk and handed to
-the operating system, so a process that is killed at any byte loses what came after that, and nothing before.
+the operating system, so a process that is killed at any byte loses only messages that came after that.
 """
 
 import time
@@ -20,12 +20,14 @@ from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
-from streamfeat.live.network import DEFAULT_PORT, Subscription, open_session
+from streamfeat.live.network import THIS_MACHINE, Network
+from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.delivery import Delivery, DeliveryStats
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import open_sinks
 
 __all__ = ["RecordJob"]
@@ -36,7 +38,7 @@ _MESSAGES = {kind.SCHEMA_NAME: kind for kind in (EventPacket, EventArray, LabelM
 
 @dataclass(frozen=True, slots=True)
 class _Flush:
-    """Time to make safe what was written."""
+    """Close a chunk here and hand it to the operating system."""
 
 
 class RecordJob:
@@ -48,9 +50,7 @@ class RecordJob:
         compression: of chunks.
         chunk_s: seconds that a crash can cost.
         overwrite: whether an existing file may be replaced.
-        reliable: recover missed packets, from publishers that do the same.
-        zenoh_config: JSON5 file; without it, this machine alone.
-        port: where sessions on this machine meet.
+        network: where to listen; `reliable` recovers missed packets, from publishers that do the same.
         console: for warnings.
 
     Raises:
@@ -65,9 +65,7 @@ class RecordJob:
         compression: Literal["zstd", "lz4", "none"] = "lz4",
         chunk_s: float = 0.5,
         overwrite: bool = False,
-        reliable: bool = False,
-        zenoh_config: Path | None = None,
-        port: int = DEFAULT_PORT,
+        network: Network = THIS_MACHINE,
         console: Console | None = None,
     ) -> None:
         """Check the arguments."""
@@ -75,7 +73,7 @@ class RecordJob:
             raise InputError(f"a chunk of {chunk_s} s is not possible; give 0.01 to 3600")
         self._names, self._target = names, target
         self._compression, self._chunk_s, self._overwrite = compression, chunk_s, overwrite
-        self._reliable, self._zenoh_config, self._port = reliable, zenoh_config, port
+        self._network = network
         self._inbox = Inbox()
         self._warnings = Warnings.on(console)
         self._topics: dict[str, Delivery] = {}
@@ -95,7 +93,7 @@ class RecordJob:
         Raises:
             InputError: the file cannot be written, or the network not be used.
         """
-        with open_session(self._zenoh_config, port=self._port) as session, signals_wait():
+        with self._network.open() as session, signals_wait():
             (sink,) = open_sinks(
                 lambda: _MessageSink(
                     RecordingWriter(
@@ -110,7 +108,7 @@ class RecordJob:
                 self._items(report), _Unchanged(), [sink]
             )
             started = time.monotonic()
-            with Subscription(session, self._names, self._inbox, reliable=self._reliable):
+            with Subscription(session, self._names, self._inbox, reliable=self._network.reliable):
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
             self._seconds = time.monotonic() - started
 
@@ -155,7 +153,7 @@ class RecordJob:
                 yield None
 
     def _is_wanted(self, message: RawMessage) -> bool:
-        """Whether it is a message of ours that did not come before; says what is missing."""
+        """Whether a message is of a known type and new; warns of those that are missing before it."""
         kind = _MESSAGES.get(message.schema)
         if message.problem or kind is None:
             self._warnings.add(message.problem or "unknown type", message.topic, message.schema[:80])

@@ -1,4 +1,4 @@
-"""How a live job is doing, as one table for people.
+"""Figures of a live job, as one table for people.
 
 Lives here: laying out what is counted.
 Not here: counting (`health`), and when the table is drawn anew (`listen`).
@@ -36,7 +36,7 @@ class HealthTable:
         cameras = self._health.cameras()
         if not cameras:
             return Text("no camera yet", style="dim")
-        table = _grid("camera", "events", "readings", "lost", "at", "prediction")
+        table = _grid("camera", "events", "emissions", "lost", "at", "prediction")
         for camera in cameras[:_CAMERAS]:
             seconds = "" if camera.t_us is None else f"{camera.t_us / 1e6:.2f} s"
             counts = (f"{n:,}" for n in (camera.events, camera.emissions, camera.lost))

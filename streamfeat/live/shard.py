@@ -1,10 +1,10 @@
 """A fixed share of the cameras, for several processes that know nothing of each other.
 
 Lives here: which of N shares a camera belongs to.
-Not here: who leaves the others out (`network`, `keep`).
+Not here: leaving other cameras out (`subscription`, `checkpoint`).
 
-Nobody hands out cameras, so nobody has to agree on anything: every process works out the same shares from
-the names alone. A camera that its process dies under waits until that process is started again.
+Every process works out the same shares from the names alone, so that processes need not agree on anything.
+The cameras of a process that dies wait until that process is started again.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Shard:
         """Read `I/N`.
 
         Raises:
-            InputError: the text is none, or there is no such share.
+            InputError: the text is something else, or there is no such share.
         """
         index, _, of = text.partition("/")
         # Digits alone: int() would take signs, spaces and underscores, and any length of them.

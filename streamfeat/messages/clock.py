@@ -43,15 +43,26 @@ class CameraClock:
 
     Args:
         window_us: length of the window; falls within it are events out of order.
+        back_us: smaller falls are events out of order, however short the window is.
     """
 
-    def __init__(self, window_us: int) -> None:
+    def __init__(self, window_us: int, back_us: int = _BACK_US) -> None:
         """No packet yet."""
-        self._back_us = max(window_us, _BACK_US)
+        self._back_us = max(window_us, back_us)
         self._last_us: int | None = None
         self._heard_ns = 0
         self._offset_us = 0
         self._epoch = 0
+
+    @property
+    def epoch(self) -> int:
+        """Of the latest packet, see `Placement`."""
+        return self._epoch
+
+    @property
+    def offset_us(self) -> int:
+        """Of the latest packet, see `Placement`."""
+        return self._offset_us
 
     def snapshot(self, now_ns: int) -> dict[str, Any]:
         """What is known of the camera's clock, as JSON values; times of ours as what has passed since."""
@@ -73,20 +84,21 @@ class CameraClock:
         self._offset_us = values.whole("offset_us", 0, _LATEST_US)
         self._epoch = values.whole("epoch")
 
-    def place(self, first_us: int, last_us: int, now_ns: int) -> Placement:
+    def place(self, first_us: int, last_us: int, now_ns: int, *, anew: bool = False) -> Placement:
         """Place the next packet.
 
         Args:
             first_us: time of its earliest event, as the camera says.
             last_us: time of its latest event.
             now_ns: when it arrived, by a clock that does not go back.
+            anew: its publisher counts anew, so that any fall is a restart.
         """
         event: Literal["", "wrapped", "restarted", "jumped"] = ""
         if self._last_us is not None:
             step = first_us + self._offset_us - self._last_us
-            elapsed_us = (now_ns - self._heard_ns) // 1000
-            if step < -self._back_us:
-                period = next((w for w in _WRAPS_US if abs(step + w) <= _NEAR_US), 0)
+            elapsed_us = max(now_ns - self._heard_ns, 0) // 1000
+            if step < (0 if anew else -self._back_us):
+                period = next((w for w in _WRAPS_US if abs(step + w) <= _NEAR_US), 0) if not anew else 0
                 event = "wrapped" if period else "restarted"
                 self._offset_us += period
             elif step > _JUMP_US + 2 * elapsed_us:

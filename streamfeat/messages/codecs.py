@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
-from streamfeat.kernels.decode import decode_evt3, decode_libcaer_cmp
+from streamfeat.kernels.decode import decode_evt3, decode_libcaer_cmp, decode_mono
 
 __all__ = [
     "EVT3_WRAP_US",
@@ -115,11 +115,12 @@ class MonoDecoder(_Alone):
 
     def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
         """See `Decoder.decode`."""
-        words = _records(payload, np.dtype("<u8"), "mono", self._max_events)
-        dt_ns = (words & 0xFFFFFFFF).astype(np.int64)
+        # A copy, so that a kernel meets one array type, whatever address the bytes had.
+        words = _records(payload, np.dtype(np.uint64), "mono", self._max_events).copy()
+        events = np.zeros(len(words), EVENT_DTYPE)
         # time_base may use all 64 bits, so the sum is taken apart instead of overflowing
-        t = time_base_ns // 1000 + (time_base_ns % 1000 + dt_ns) // 1000
-        return make_events(words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63, t)
+        decode_mono(words, *divmod(time_base_ns, 1000), events)
+        return events
 
 
 class LibcaerDecoder(_Alone):

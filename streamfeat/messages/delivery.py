@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 from streamfeat.errors import InputError
 from streamfeat.files.json_fields import Fields
+from streamfeat.messages.cdr import EventPacket
 
-__all__ = ["Delivery", "DeliveryStats", "Verdict"]
+__all__ = ["Delivery", "DeliveryStats", "Verdict", "fingerprint_of"]
 
 _REMEMBERED = 1024
 """Missing numbers that a late packet can still fill in."""
@@ -74,6 +75,21 @@ class Verdict(NamedTuple):
     foreign: bool = False
 
 
+def fingerprint_of(packet: EventPacket) -> int:
+    """A number that two packets share if one is a copy of the other, and hardly ever otherwise."""
+    events = packet.events
+    ends = bytes(events[:64]), bytes(events[-64:])
+    about = (
+        packet.stamp_ns,
+        packet.time_base,
+        packet.encoding,
+        packet.height,
+        packet.width,
+        packet.is_bigendian,
+    )
+    return hash((*about, len(events), *ends))
+
+
 class Delivery:
     """Follows the numbers of one topic, whoever publishes it."""
 
@@ -89,8 +105,19 @@ class Delivery:
         self._next = 0
         self._missing: dict[int, None] = {}
         self._old: list[int] = []
+        self._marks: dict[int, int] = {}
+        self._stamp_ns = 0
 
-    def see(self, gid: bytes, seq: int, now_ns: int, dropped: int = 0) -> Verdict:
+    def see(
+        self,
+        gid: bytes,
+        seq: int,
+        now_ns: int,
+        dropped: int = 0,
+        *,
+        mark: int | None = None,
+        stamp_ns: int = 0,
+    ) -> Verdict:
         """Judge the next packet.
 
         Args:
@@ -98,14 +125,28 @@ class Delivery:
             seq: number of the packet.
             now_ns: when it arrived, by any clock that does not go back.
             dropped: packets of this topic that were dropped since the one before.
+            mark: of its content, see `fingerprint_of`; tells a duplicate from a new beginning at once.
+            stamp_ns: time in its header, with a mark.
         """
+        verdict = self._judge(gid, seq, now_ns, dropped, mark, stamp_ns)
+        if mark is not None and verdict.use:
+            self._marks.pop(seq, None)
+            self._marks[seq] = mark
+            self._stamp_ns = stamp_ns
+            while len(self._marks) > _REMEMBERED:
+                del self._marks[next(iter(self._marks))]
+        return verdict
+
+    def _judge(
+        self, gid: bytes, seq: int, now_ns: int, dropped: int, mark: int | None, stamp_ns: int
+    ) -> Verdict:
         self.stats.dropped += dropped
         is_other = self._gid is not None and gid != self._gid
         if is_other and not self._have_left and now_ns - self._heard_ns < _SILENCE_NS:
             self._other = gid
             self.stats.foreign += 1
             return Verdict(use=False, lost=dropped, foreign=True)
-        if gid != self._gid or self._counts_anew(seq):
+        if gid != self._gid or self._counts_anew(seq, mark, stamp_ns):
             return self._take_over(gid, seq, now_ns, dropped)
         self._heard_ns = now_ns
         # The last packets of those who have left may come after word of it.
@@ -158,11 +199,15 @@ class Delivery:
         self._has_come |= here
         self._have_left |= not here
 
-    def _counts_anew(self, seq: int) -> bool:
-        if abs(seq - self._next) > _FAR:
-            return True
+    def _counts_anew(self, seq: int, mark: int | None, stamp_ns: int) -> bool:
+        if self._gid is not None and abs(seq - self._next) > _FAR:
+            return self._marks.get(seq, not mark) != mark
         if self._gid or seq >= self._next or seq in self._missing:
             return False
+        if mark is not None and seq in self._marks:
+            return self._marks[seq] != mark
+        if mark is not None and stamp_ns > self._stamp_ns:
+            return True
         # Without an identity an old number is a duplicate or a new beginning; a row of them is the latter.
         self._old = [*self._old, seq] if not self._old or seq == self._old[-1] + 1 else [seq]
         return len(self._old) >= _OLD_IN_A_ROW
@@ -178,6 +223,7 @@ class Delivery:
         self._has_come = False
         self._gid, self._heard_ns, self._next = gid, now_ns, seq + 1
         self._missing.clear()
+        self._marks.clear()
         self._old.clear()
         self.stats.received += 1
         self.stats.lost += lost

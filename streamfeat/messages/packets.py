@@ -23,11 +23,9 @@ from streamfeat.messages.codecs import (
     encode,
     make_decoder,
 )
+from streamfeat.messages.event_messages import EVENT_SCHEMAS, parse_events
 
 __all__ = ["EVENT_SCHEMAS", "MAX_PIXELS", "Label", "Packet", "PacketReader", "PacketWriter", "Watermark"]
-
-EVENT_SCHEMAS = (EventPacket.SCHEMA_NAME, EventArray.SCHEMA_NAME)
-"""Messages that carry events."""
 
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
@@ -113,18 +111,23 @@ class PacketReader:
         self._is_broken = False
         self._before: tuple[int, int] | None = None
 
-    def read(self, schema: str, data: bytes | memoryview, log_time_ns: int, sequence: int) -> Packet:
-        """Read one message; `sequence` stands in where the message has no number of its own.
+    def read(
+        self,
+        schema: str,
+        data: bytes | memoryview | EventPacket | EventArray,
+        log_time_ns: int,
+        sequence: int,
+    ) -> Packet:
+        """Read one message, parsed or not; `sequence` stands in where it has no number of its own.
 
         Raises:
             InputError: the bytes are no such message, or its payload is not what it says.
         """
-        if schema == EventArray.SCHEMA_NAME:
-            array = EventArray.from_cdr(data)
-            self.encoding, self.time_us = "dvs_msgs", None
-            resolution = _resolution(array.height, array.width)
-            return Packet(self._topic, array.events, resolution, log_time_ns, sequence)
-        packet = EventPacket.from_cdr(data)
+        packet = data if isinstance(data, EventPacket | EventArray) else parse_events(schema, data)
+        if isinstance(packet, EventArray):
+            self.encoding, self.time_us = schema.partition("/")[0], None
+            resolution = _resolution(packet.height, packet.width)
+            return Packet(self._topic, packet.events, resolution, log_time_ns, sequence)
         if self._last_seq is not None and packet.seq > self._last_seq + 1:
             self.resync()
         self._last_seq = packet.seq
@@ -209,6 +212,10 @@ class PacketWriter:
         make_decoder(encoding)
         self._encoding, self._frame_id = encoding, frame_id
         self._seq = 0
+        self._after_us = 0
+
+    def restart(self) -> None:
+        """The events that follow are of another epoch: their times have nothing to do with those before."""
         self._after_us = 0
 
     def messages(self, events: Events, resolution: Resolution) -> Iterator[EventPacket]:

@@ -1,7 +1,7 @@
-"""Reading recordings: batches, packets, labels and labelled samples out of an MCAP file.
+"""Reading recordings: batches, packets, labels and labelled samples.
 
 Lives here: `open_recording` and what it gives; choosing the topic, decoding, counting.
-Not here: the file format and its damage (`records`), messages (`streamfeat.messages`), writing (`writer`).
+Not here: formats (`sources`), messages (`streamfeat.messages`), writing (`writer`).
 
 A recording is read in file order with one packet in memory at a time. What cannot be read is skipped and
 counted in `Recording.losses`; only a recording that yields nothing at all is an error.
@@ -9,31 +9,29 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
-from os import PathLike
+from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
-import numpy as np
-from mcap.records import Channel, Schema
-
+from streamfeat.denoise.stage import Denoiser
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
-from streamfeat.files.locations import Location, StoreLocation, absolute, location_of
+from streamfeat.files.locations import Location, absolute, location_of
 from streamfeat.messages.cdr import LabelMessage
-from streamfeat.messages.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader
-from streamfeat.recordings.records import (
-    Losses,
-    Summary,
-    count_missing,
-    iter_messages,
-    iter_records,
-    open_mcap,
-    read_summary,
-)
+from streamfeat.messages.packets import Label, Packet
+from streamfeat.messages.timeline import Timeline
+from streamfeat.recordings.bags import assumptions_of
+from streamfeat.recordings.labels import read_labels, with_labels
+from streamfeat.recordings.opening import RecordingPath, open_source
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
+from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
+from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
+from streamfeat.recordings.totals import Totals
+from streamfeat.report.shown import Shown
 
 __all__ = [
     "HELD_OUT_SPLITS",
@@ -49,6 +47,7 @@ __all__ = [
 ]
 
 _LOOP_GAP_US = 1_000_000
+_TOPICS_SHOWN = 20
 
 _PART_BYTES = 1 << 20
 _MOST_PARTS = 1000
@@ -57,73 +56,31 @@ HELD_OUT_SPLITS = frozenset({"validation", "valid", "val", "test"})
 """Splits that nothing is learned from."""
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One topic of a recording."""
-
-    name: str
-    schema: str
-    schema_encoding: str
-    n_messages: int
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Some chunks of a recording, from byte `start` to byte `end`.
-
-    Where there are labels it begins with the first in those chunks and reaches to the first behind them, so
-    that the parts of a recording hold each label and its events once, whichever chunk these are in.
-    """
-
-    start: int
-    end: float
-
-
-WHOLE = Part(0, math.inf)
-"""All of a recording."""
-
-
-@dataclass(slots=True)
-class _Totals:
-    """What only a full pass can tell."""
-
-    labels: list[Label] = field(default_factory=list)
-    n_on: int = 0
-    n_off: int = 0
-    first_us: int | None = None
-    last_us: int | None = None
-
-    def add(self, events: Events) -> None:
-        if len(events) == 0:
-            return
-        on = int(np.count_nonzero(events["p"]))
-        self.n_on += on
-        self.n_off += len(events) - on
-        first, last = int(events["t"].min()), int(events["t"].max())
-        self.first_us = first if self.first_us is None else min(first, self.first_us)
-        self.last_us = last if self.last_us is None else max(last, self.last_us)
-
-
-def open_recording(path: str | PathLike[str] | StoreLocation, topic: str | None = None) -> "Recording":
-    """Open an MCAP recording of events.
+def open_recording(
+    path: RecordingPath, topic: str | None = None, options: ReadOptions = AS_IT_IS
+) -> "Recording":
+    """Open a recording of events: MCAP, a bag of ROS 1 or 2, a camera file, or several of one kind.
 
     Args:
-        path: the file; text that is a URL means a file in a store, see `streamfeat.files.locations`.
+        path: a file; a rosbag2 folder; a pattern or a list, whose files are one recording. Text that is a
+            URL means a file in a store, see `streamfeat.files.locations`.
         topic: the event topic to read; may be left out when there is only one.
+        options: what the recording does not say, labels for it, noise to be taken out.
 
     Raises:
-        InputError: the file is missing, empty or no MCAP; it has no event topic, several and none was
-            chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
+        InputError: the file is missing, empty or of no known format; it has no event topic, several and none
+            was chosen, or not the chosen one; or not a single packet of the topic can be read. Reading raises
             it, too, where a store refuses or goes away.
     """
-    return Recording(path, topic)
+    return Recording(path, topic, options=options)
 
 
-class Recording:
+class Recording(Shown):
     """A recording of events, read in file order; iterate as often as you like.
 
     `resolution` and `encoding` are those of the first packet. `losses` tells what the latest pass
-    (an iteration, or the first use of a count) could not read.
+    (an iteration, or the first use of a count) could not read, `removed` what of it was taken out as noise.
+    `assumptions` are lines that say what the files leave open and how it was decided.
     """
 
     path: Location
@@ -132,28 +89,31 @@ class Recording:
     resolution: Resolution
     encoding: str
     losses: Losses
+    assumptions: list[str]
 
     def __init__(
-        self, path: str | PathLike[str] | StoreLocation, topic: str | None = None, part: Part = WHOLE
+        self,
+        path: RecordingPath,
+        topic: str | None = None,
+        part: Part = WHOLE,
+        options: ReadOptions = AS_IT_IS,
     ) -> None:
         """See `open_recording`."""
-        self.path = location_of(path)
-        self._part = part
-        self._file = open_mcap(self.path)
+        labels = read_labels(Path(options.labels)) if options.labels is not None else None
+        self._source = open_source(path, topic, options)
+        self._given, self._part, self._options, self._labels = path, part, options, labels
+        self.assumptions = assumptions_of(self._source)
+        if labels and labels.assumption:
+            self.assumptions.append(labels.assumption)
         try:
-            summary = read_summary(self._file)
-            # Counts from a summary tell what should be there; a scan can only tell what is.
-            self._has_summary = summary is not None
-            self._known = summary or _scan(self._file)
-            self.topics = _topics(self._known)
-            self.topic = _choose_topic(
-                self.path, [t for t in self.topics if t.schema in EVENT_SCHEMAS], topic
-            )
+            self.path, self.topics = self._source.path, self._source.topics
+            self.topic = _choose_topic(self.path, self.topics, topic)
             self.encoding = ""
+            self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution
             self.losses = Losses()
         except BaseException:
-            self._file.close()
+            self._source.close()
             raise
 
     def __enter__(self) -> Self:
@@ -167,8 +127,8 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the file; iterating after that is an error."""
-        self._file.close()
+        """Close what it is read from; iterating after that is an error."""
+        self._source.close()
 
     def __iter__(self) -> Iterator[Events]:
         """Yield batches of events in stored order: `(n,)` arrays of `EVENT_DTYPE`, n > 0."""
@@ -179,15 +139,23 @@ class Recording:
     @property
     def is_labelled(self) -> bool:
         """Whether there may be labels."""
-        return any(topic.schema == LabelMessage.SCHEMA_NAME for topic in self.topics)
+        return self._labels is not None or any(topic.holds == "labels" for topic in self.topics)
+
+    @property
+    def removed(self) -> dict[str, int]:
+        """Events that the latest pass took out as noise, by reason."""
+        return {name: self.losses.removed[name] for name in self._options.denoising.names}
 
     def parts(self) -> list[Part]:
         """Parts of some megabytes, in stored order, by which pieces of work are cut; see `part`.
 
-        They depend on the file alone. There is but one where the file does not tell where its chunks are, or
-        where packets cannot be read without those before them (evt3).
+        They depend on the file alone. There is but one where the file does not tell where its chunks are,
+        where packets cannot be read without those before them (evt3), where labels are put into the stream,
+        and where noise is taken out of a stream without labels, at which that would start anew.
         """
-        starts = sorted(self._known.chunk_starts) if self.encoding != "evt3" else []
+        is_whole = self.encoding == "evt3" or self._labels is not None
+        is_whole |= bool(self._options.denoising) and not self.is_labelled
+        starts = self._source.cuts() if not is_whole else []
         cuts = [0]
         for start in starts:
             if start >= cuts[-1] + max(_PART_BYTES, starts[-1] // _MOST_PARTS):
@@ -196,7 +164,7 @@ class Recording:
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
         """What opens some of this recording, wherever that is called, and can be pickled."""
-        return partial(Recording, absolute(self.path), self.topic, part)
+        return partial(Recording, _wherever(self._given), self.topic, part, self._options)
 
     def items(self) -> Iterator[Packet | Label]:
         """Yield packets and labels in stored order; a label comes before its first packet."""
@@ -216,36 +184,65 @@ class Recording:
         Args:
             part: where to begin; what is lost behind it is not counted.
         """
+        placed = self._stored_items(part)
+        if self._labels:
+            placed = with_labels(placed, self._labels)
+        if self._options.denoising:
+            placed = self._without_noise(placed, part)
+        return placed
+
+    def _without_noise(
+        self, placed: Iterator[tuple[int, Packet | Label]], part: Part
+    ) -> Iterator[tuple[int, Packet | Label]]:
+        """Items of a part without their noise; what is taken out is counted in one part only."""
+        denoiser = Denoiser(self._options.denoising)
+        before, is_labelled = Counter[str](), self.is_labelled
+        is_counted = part.start == 0 or not is_labelled
+        for at, item in placed:
+            if is_labelled and isinstance(item, Label):
+                before = before if is_counted else Counter(denoiser.removed)
+                is_counted = at < part.end
+            kept = denoiser.process(item)
+            if is_counted:
+                self.losses.removed = Counter(denoiser.removed) - before
+            yield at, kept
+
+    def _stored_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
+        """As `placed_items`, of what is in the files."""
         losses = self.losses = Losses()
-        reader = PacketReader(self.topic)
-        seen: Counter[int] = Counter()
-        for at, channel, schema, message in iter_messages(
-            self._file, self._known, losses, part.start, part.end
-        ):
+        timeline = self._timeline = Timeline(self.topic)
+        at = part.start
+        for at, stored in self._source.read(self.topic, part, losses):
             if at >= part.end:
                 losses = Losses()
-            is_label = schema.name == LabelMessage.SCHEMA_NAME
-            if not is_label and (channel.topic != self.topic or schema.name not in EVENT_SCHEMAS):
-                continue
-            seen[channel.id] += 1
-            item: Packet | Label
             try:
-                if is_label:
-                    item = Label.from_cdr(message.data)
-                else:
-                    item = reader.read(schema.name, message.data, message.log_time, message.sequence)
-                    self._check_size(item)
-                    self.encoding = self.encoding or reader.encoding
+                for item in self._placed(timeline, stored):
+                    yield at, item
             except InputError as error:
-                where = f"topic {channel.topic!r}, message {seen[channel.id]} (byte {at}): {error}"
-                losses.add("bad label" if is_label else "bad packet", len(message.data), where)
-            else:
-                yield at, item
-        promised = self._known.channels if self._has_summary and part == WHOLE else {}
-        for channel_id, channel in promised.items():
-            kind = self._known.schemas.get(channel.schema_id)
-            if channel.topic == self.topic or (kind and kind.name == LabelMessage.SCHEMA_NAME):
-                count_missing(self._known, channel_id, seen[channel_id], losses)
+                assert isinstance(stored, StoredMessage)
+                where = f"topic {stored.topic!r}, message {stored.number} (byte {at}): {error}"
+                kind = "bad label" if stored.schema == LabelMessage.SCHEMA_NAME else "bad packet"
+                losses.add(kind, len(stored.data), where)
+        for item in timeline.finish():
+            yield at, item
+
+    def _placed(self, timeline: Timeline, stored: SourceItem) -> Iterator[Packet | Label]:
+        if isinstance(stored, Packet):
+            yield from timeline.packet(stored)
+        elif isinstance(stored, Label):
+            yield from timeline.label(stored)
+        elif stored.schema == LabelMessage.SCHEMA_NAME:
+            yield from timeline.label(Label.from_cdr(unpacked_message(stored.data)))
+        else:
+            about = stored.log_time_ns, stored.sequence, stored.encoding
+            for item in timeline.message(stored.schema, unpacked_message(stored.data), *about):
+                self.encoding = self.encoding or timeline.encoding
+                yield item
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        return self._timeline.counts
 
     def played(
         self, *, loop: bool, report: Callable[[int, int], None] = lambda done, total: None
@@ -257,25 +254,32 @@ class Recording:
             report: told, with each item of the first time, how many there have been and how many there are;
                 0 if that is unknown.
         """
-        wanted = {*EVENT_SCHEMAS, LabelMessage.SCHEMA_NAME}
-        topics = [t for t in self.topics if t.schema in wanted]
-        total = sum(t.n_messages for t in topics if t.name == self.topic or t.schema not in EVENT_SCHEMAS)
-        for done, item in enumerate(self.items(), 1):
-            yield item
-            report(done, 0 if loop else total)
-        if not loop or self.first_us is None or self.last_us is None:
-            return
-        step_us = self.last_us - self.first_us + _LOOP_GAP_US
-        shift_us = 0
+        total = sum(
+            t.n_messages
+            for t in self.topics
+            if t.holds == "labels" or (t.holds == "events" and t.name == self.topic)
+        )
+        # Where a clock starts anew the times of one round are several spans: the next begins behind them all.
+        shift_us = epochs = 0
         while True:
-            shift_us += step_us
-            for item in self.items():
+            first_us = last_us = epoch = None
+            for done, item in enumerate(self.items(), 1):
                 if isinstance(item, Packet):
-                    events = item.events.copy()
-                    events["t"] += shift_us
-                    yield replace(item, events=events)
-                else:
-                    yield replace(item, start_us=item.start_us + shift_us)
+                    if len(item.events):
+                        t = item.events["t"]
+                        low, high = int(t.min()), int(t.max())
+                        first_us = low if first_us is None else min(first_us, low)
+                        last_us = high if last_us is None else max(last_us, high)
+                    epoch = item.epoch
+                if shift_us:
+                    item = _shifted(item, shift_us, epochs)
+                yield item
+                if not shift_us:
+                    report(done, 0 if loop else total)
+            if not loop or first_us is None or last_us is None:
+                return
+            shift_us += last_us - first_us + _LOOP_GAP_US
+            epochs += (epoch or 0) + bool(epoch)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the labelled samples in stored order; those of a part to their end, wherever that is.
@@ -285,8 +289,8 @@ class Recording:
         return complete_samples(self.placed_items(self._part), self._part.end, self.resolution)
 
     @cached_property
-    def _totals(self) -> _Totals:
-        totals = _Totals()
+    def _totals(self) -> Totals:
+        totals = Totals()
         for item in self.items():
             if isinstance(item, Label):
                 totals.labels.append(item)
@@ -315,6 +319,14 @@ class Recording:
         return self.n_on + self.n_off
 
     @property
+    def digest(self) -> str:
+        """SHA-256, hexadecimal, of all events that are used, in their order: 13 bytes each, little-endian.
+
+        These are x and y (uint16), p (uint8) and t (int64, microseconds). Where packets end has no say.
+        """
+        return self._totals.hash.hexdigest()
+
+    @property
     def first_us(self) -> int | None:
         """Time of the earliest event, or None without events."""
         return self._totals.first_us
@@ -329,50 +341,42 @@ class Recording:
         """Time from the earliest to the latest event."""
         return (self.last_us or 0) - (self.first_us or 0)
 
-    @staticmethod
-    def _check_size(packet: Packet) -> None:
-        height, width = packet.resolution
-        if height * width > MAX_PIXELS:
-            raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
-
     def _first_packet(self) -> Packet:
-        for _, item in self.placed_items(WHOLE):
+        for _, item in self._stored_items(WHOLE):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
 
 
-def _scan(file: BinaryIO) -> Summary:
-    """Build what a summary would say, from the records that are there."""
-    found, counts = Summary(), Counter[int]()
-    for _, record in iter_records(file, Losses()):
-        if isinstance(record, Channel):
-            found.channels[record.id] = record
-        elif isinstance(record, Schema):
-            found.schemas[record.id] = record
-        else:
-            counts[record.channel_id] += 1
-    found.message_counts = dict(counts)
-    return found
+def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label:
+    if isinstance(item, Label):
+        return replace(item, start_us=item.start_us + shift_us)
+    events = item.events.copy()
+    events["t"] += shift_us
+    log_time_ns = item.log_time_ns + shift_us * 1000
+    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns)
 
 
-def _topics(known: Summary) -> list[Topic]:
-    """List the topics; several channels of one topic and schema are one."""
-    counts: dict[tuple[str, str, str], int] = {}
-    for channel in known.channels.values():
-        schema = known.schemas.get(channel.schema_id)
-        key = (channel.topic, schema.name if schema else "", schema.encoding if schema else "")
-        counts[key] = counts.get(key, 0) + known.message_counts.get(channel.id, 0)
-    return [Topic(*key, n_messages=n) for key, n in counts.items()]
+def _wherever(path: RecordingPath) -> RecordingPath:
+    """The same files, whatever folder somebody works in."""
+    if isinstance(path, str) or not isinstance(path, Sequence):
+        return absolute(location_of(path))
+    return [absolute(location_of(one)) for one in path]
 
 
 def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
-    names = sorted({t.name for t in topics if t.schema in EVENT_SCHEMAS})
+    names = sorted({topic.name for topic in topics if topic.holds == "events"})
     if not names:
-        raise InputError(f"{path}: no topic carries {' or '.join(EVENT_SCHEMAS)}; is this the right file?")
+        others = ", ".join(f"{topic.name} ({topic.schema or 'no type'})" for topic in topics[:_TOPICS_SHOWN])
+        more = f" and {len(topics) - _TOPICS_SHOWN} more" if len(topics) > _TOPICS_SHOWN else ""
+        raise InputError(
+            f"{path}: no topic carries events; " + (f"there are {others}{more}" if topics else "it has none")
+        )
     if wanted is None and len(names) > 1:
-        raise InputError(f"{path}: several topics carry events, choose one of {names}")
+        raise InputError(
+            f"{path}: {len(names)} topics carry events: {', '.join(names)}; choose one with --topic"
+        )
     if wanted is not None and wanted not in names:
-        raise InputError(f"{path}: no events on topic {wanted!r}; topics with events: {names}")
+        raise InputError(f"{path}: no events on topic {wanted}; --topic can be {', '.join(names)}")
     return wanted or names[0]

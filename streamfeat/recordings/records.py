@@ -13,25 +13,26 @@ import os
 import re
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Header, Message, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Header, Message, Schema, Statistics
 
-from streamfeat.errors import InputError, printable
+from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, open_binary
+from streamfeat.recordings.losses import Losses
 
 __all__ = [
     "MAX_RECORD_BYTES",
+    "Block",
     "Losses",
     "Summary",
     "count_missing",
@@ -56,36 +57,20 @@ _CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
 
+_CHUNK = struct.Struct("<QQQII")  # times, size and CRC of its records, length of the compression's name
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+
 _NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 Record = Schema | Channel | Message
 
 
-@dataclass(slots=True)
-class Losses:
-    """What one pass over a recording could not read, by named reason."""
+class Block(NamedTuple):
+    """A chunk of a file: its byte, and the earliest and latest log time in it, nanoseconds since 1970."""
 
-    counts: Counter[str] = field(default_factory=Counter)
-    bytes: Counter[str] = field(default_factory=Counter)
-    first: dict[str, str] = field(default_factory=dict)
-    """For each reason, where it struck first and why."""
-
-    def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
-        """Count one loss."""
-        self.counts[reason] += count
-        self.bytes[reason] += n_bytes
-        if reason not in self.first:
-            self.first[reason] = printable(where)
-
-    def add_all(self, others: "Losses") -> None:
-        """Count the losses of another part of the same recording."""
-        self.counts += others.counts
-        self.bytes += others.bytes
-        self.first = others.first | self.first
-
-    def __bool__(self) -> bool:
-        """Whether anything was lost."""
-        return bool(self.counts)
+    at: int
+    first_ns: int
+    last_ns: int
 
 
 @dataclass(slots=True)
@@ -96,8 +81,7 @@ class Summary:
     channels: dict[int, Channel] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages of each channel id."""
-    chunk_starts: list[int] = field(default_factory=list)
-    """The byte where each chunk starts."""
+    blocks: list[Block] = field(default_factory=list)  # not sorted
 
 
 def open_mcap(place: Location) -> BinaryIO:
@@ -123,7 +107,12 @@ def open_mcap(place: Location) -> BinaryIO:
 
 
 def iter_messages(
-    file: BinaryIO, known: Summary | None, losses: Losses, start: int = 0, end: float = math.inf
+    file: BinaryIO,
+    known: Summary | None,
+    losses: Losses,
+    start: int = 0,
+    end: float = math.inf,
+    stop: float = math.inf,
 ) -> Iterator[tuple[int, Channel, Schema, Message]]:
     """Yield messages in file order, each with its byte (see `iter_records`), channel and schema.
 
@@ -131,12 +120,11 @@ def iter_messages(
         file: opened by `open_mcap`.
         known: what the summary said; its channels stand in for those lost in a damaged chunk.
         losses: changed.
-        start: see `iter_records`.
-        end: see `iter_records`.
+        start, end, stop: see `iter_records`.
     """
     schemas = {0: _NO_SCHEMA} | (known.schemas if known else {})
     channels = dict(known.channels if known else {})
-    for at, record in iter_records(file, losses, start, end):
+    for at, record in iter_records(file, losses, start, end, stop):
         if at >= end:
             losses = Losses()
         if isinstance(record, Channel):
@@ -154,25 +142,28 @@ def iter_messages(
 
 
 def iter_records(
-    file: BinaryIO, losses: Losses, start: int = 0, end: float = math.inf
+    file: BinaryIO, losses: Losses, start: int = 0, end: float = math.inf, stop: float = math.inf
 ) -> Iterator[tuple[int, Record]]:
     """Yield schemas, channels and messages in file order, each with the byte where it starts.
 
-    Messages of a chunk carry the byte of the chunk. Damage is skipped up to the next readable record or
-    chunk and counted in `losses`, which is changed. Nothing is raised but errors of reading: `OSError`, or
-    `InputError` where the file is in a store.
+    Messages of a chunk carry the byte of the chunk, and their data is a view of it. Damage is skipped up to
+    the next readable record or chunk and counted in `losses`, which is changed. Nothing is raised but errors
+    of reading: `OSError`, or `InputError` where the file is in a store.
 
     Args:
         file: opened by `open_mcap`.
         losses: changed.
         start: the byte of a chunk to begin with; 0 for the first record.
         end: from this byte on losses are not counted, for somebody else does.
+        stop: end at this byte.
     """
     size = file.seek(0, os.SEEK_END)
     at = trusted = max(start, len(_MAGIC))  # up to `trusted`, records start where we think they do
     while True:
         if at >= end:
             losses = Losses()
+        if at >= stop:
+            return
         file.seek(at)
         head = file.read(_CHUNK_HEAD_BYTES)
         if len(head) < _FRAME.size:
@@ -188,9 +179,13 @@ def iter_records(
             following = _find_chunk(file, trusted + 1, size)
             reason = "truncated" if following is None and after > size else "damaged record"
             where = f"byte {at}: record type {opcode} with {length} bytes cannot be here"
+            where += f"; the file ends at byte {size}" if after > size else ""
             start = at if following is None or following > at else trusted
             losses.add(reason, (following or size) - start, where)
             if following is None:
+                if reason == "truncated" and opcode == Opcode.CHUNK:
+                    file.seek(at + _FRAME.size)
+                    yield from _cut_chunk(file.read(MAX_RECORD_BYTES), at)
                 return
             at = trusted = following
             continue
@@ -253,22 +248,27 @@ def _parse_summary(section: bytes) -> Summary | None:
             elif opcode == Opcode.STATISTICS:
                 summary.message_counts = Statistics.read(body).channel_message_counts
             elif opcode == Opcode.CHUNK_INDEX:
-                summary.chunk_starts.append(ChunkIndex.read(body).chunk_start_offset)
+                index = ChunkIndex.read(body)
+                times = index.message_start_time, index.message_end_time
+                summary.blocks.append(Block(index.chunk_start_offset, *times))
     except _DAMAGE:
         return None
     return summary if summary.channels else None
 
 
-def _one_record(opcode: int, body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
-    stream = ReadDataStream(BytesIO(body))
+def _one_record(
+    opcode: int, body: bytes | memoryview, at: int, losses: Losses
+) -> Iterator[tuple[int, Record]]:
     record: Record
     try:
         if opcode == Opcode.MESSAGE:
-            record = Message.read(stream, len(body))
+            channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+            data = memoryview(body)[_MESSAGE_HEAD.size :]
+            record = Message(channel, log_time, data, publish_time, sequence)  # type: ignore[arg-type]
         elif opcode == Opcode.CHANNEL:
-            record = Channel.read(stream)
+            record = Channel.read(ReadDataStream(BytesIO(body)))
         else:
-            record = Schema.read(stream)
+            record = Schema.read(ReadDataStream(BytesIO(body)))
     except _DAMAGE as error:
         losses.add("damaged record", len(body), f"byte {at}: {error or type(error).__name__}")
     else:
@@ -277,11 +277,11 @@ def _one_record(opcode: int, body: bytes, at: int, losses: Losses) -> Iterator[t
 
 def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
     try:
-        data = _decompress(Chunk.read(ReadDataStream(BytesIO(body))))
+        data = _records_of_chunk(memoryview(body))
     except _DAMAGE as error:
         losses.add("damaged chunk", len(body), f"byte {at}: {error or type(error).__name__}")
         return
-    inner = 0
+    inner, view = 0, memoryview(data)
     while inner < len(data):
         start = inner + _FRAME.size
         opcode, length = _FRAME.unpack_from(data, inner) if start <= len(data) else (0, 0)
@@ -290,31 +290,46 @@ def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, 
             return
         inner = start + length
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield from _one_record(opcode, data[start:inner], at, losses)
+            yield from _one_record(opcode, view[start:inner], at, losses)
 
 
-def _decompress(chunk: Chunk) -> bytes:
+def _cut_chunk(body: bytes, at: int) -> Iterator[tuple[int, Record]]:
+    """The whole records of an uncompressed chunk that the end of the file cuts short."""
+    if body[28:32] == bytes(4):  # no compression
+        inner, view = 40, memoryview(body)
+        while inner + _FRAME.size <= len(body):
+            opcode, length = _FRAME.unpack_from(body, inner)
+            start, inner = inner + _FRAME.size, inner + _FRAME.size + length
+            if inner <= len(body) and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                yield from _one_record(opcode, view[start:inner], at, Losses())
+
+
+def _records_of_chunk(body: memoryview) -> bytes | memoryview:
     """Uncompress a chunk, never to more than it claims, and check its CRC."""
-    claimed = chunk.uncompressed_size
+    _, _, claimed, crc, name_length = _CHUNK.unpack_from(body)
+    start = _CHUNK.size + name_length + 8
+    (length,) = struct.unpack_from("<Q", body, start - 8)
+    compression, stored = bytes(body[_CHUNK.size : start - 8]), body[start : start + length]
+    if len(stored) < length:
+        raise ValueError(f"the chunk claims {length} stored bytes and holds {len(stored)}")
     if claimed > MAX_RECORD_BYTES:
         raise ValueError(f"the chunk claims {claimed} bytes, the limit is {MAX_RECORD_BYTES}")
-    if chunk.compression == "zstd":
+    data: bytes | memoryview = stored
+    if compression == b"zstd":
         # `zstandard.decompress` believes the size in the frame; the stream reader takes ours.
         try:
-            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(claimed + 1)
+            data = zstandard.ZstdDecompressor().stream_reader(stored).read(claimed + 1)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from None
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=claimed + 1)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"unknown compression {chunk.compression!r}")
+    elif compression == b"lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=claimed + 1)
+    elif compression:
+        raise ValueError(f"unknown compression {compression.decode()!r}")
     if len(data) != claimed:
         raise ValueError(f"the chunk claims {claimed} bytes and holds {len(data)}")
-    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+    if crc not in (0, zlib.crc32(data)):
         raise ValueError("the CRC of the chunk does not match")
-    return bytes(data)
+    return data
 
 
 def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:

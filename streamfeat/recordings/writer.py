@@ -58,7 +58,8 @@ def recover(
         What could not be read.
 
     Raises:
-        InputError: `source` is no MCAP file at all, or `target` exists or cannot be written.
+        InputError: `source` is no MCAP file at all, or damaged and without a single whole message; or
+            `target` exists or cannot be written. `target` is then as it was before.
     """
     losses, copied = Losses(), Counter[int]()
     # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
@@ -70,6 +71,9 @@ def recover(
             writer._copy(channel, schema, message)
             copied[channel.id] += 1
             report("recovering", done, total, "")
+        if losses and not copied:
+            reason = next(iter(losses.first.values()))
+            raise InputError(f"{source}: no whole message could be recovered; {reason}")
     for channel_id in summary.message_counts if summary else ():
         count_missing(summary, channel_id, copied[channel_id], losses)
     return losses
@@ -286,7 +290,7 @@ class RecordingWriter:
                 self._schemas.get(channel.schema_id, 0),
                 channel.metadata,
             )
-        times = message.log_time, message.data, message.publish_time
+        times = message.log_time, bytes(message.data), message.publish_time
         self._add(self._channels[channel.id], *times, message.sequence)
 
     def _add(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:

@@ -1,6 +1,6 @@
 """Several cameras side by side: one session for each topic, made when it appears and released when it leaves.
 
-Lives here: which session an item goes to, how many there may be, and what becomes of one that fails.
+Lives here: which session an item goes to, how many there may be, and how one that fails is replaced.
 Not here: what a session does (`session`), where items come from (`live`).
 """
 
@@ -22,7 +22,7 @@ MAX_CAMERAS = 64
 
 @dataclass(frozen=True, slots=True)
 class CameraLeft:
-    """Nobody publishes on a topic any more."""
+    """The last publisher of a topic has left."""
 
     topic: str
 
@@ -84,7 +84,7 @@ class Cameras:
         self.seen += 1
 
     def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
-        """Hand an item to the session of its topic, and yield what is read on the way."""
+        """Hand an item to the session of its topic, and yield the emissions on the way."""
         if isinstance(item, CameraLeft):
             yield from self._release(item.topic)
             return

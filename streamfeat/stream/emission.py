@@ -1,7 +1,7 @@
-"""What is read from a stream, and when.
+"""What comes out of a stream, and when.
 
-Lives here: `Emission`, one reading of the features; `EmitPolicy`, how often to read.
-Not here: the reading itself (`session`), or where it goes (`sinks`).
+Lives here: `Emission`, features at one time with their prediction; `EmitPolicy`, how often they are emitted.
+Not here: making emissions (`session`), or where they go (`sinks`).
 """
 
 import re
@@ -17,22 +17,26 @@ from streamfeat.messages.packets import Label
 __all__ = ["Emission", "EmitPolicy"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Emission:
-    """One reading of the features, with the prediction that follows from it.
+    """Features at one stream time, with the prediction that follows from them.
+
+    Example:
+        >>> emission.t_us, emission.prediction, emission.features.shape
+        (310000, '7', (3200,))
 
     Attributes:
-        t_us: stream time; the reading reflects every event before it that has arrived.
+        t_us: stream time; the features reflect every event before it that has arrived.
         n_events: events counted by the session so far.
         features: `(n_features,)` float32.
         labels: names that the scores belong to; empty without a classifier.
         scores: `(C,)` float32.
         sample: the labelled sample that is open, if any.
-        final: this is the reading at the end of that sample, the one that counts.
+        final: this is the emission at the end of that sample, the one that is scored.
         topic: of the camera, where there may be several.
         incomplete: packets are known to be missing from the window.
-        source_ns: when the packet that brought about this reading was published, by its publisher's clock; 0
-            if that is unknown, or silence brought it about.
+        source_ns: when the packet that caused this emission was published, by its publisher's clock; 0 where
+            that is unknown, or silence caused it.
     """
 
     t_us: int
@@ -45,6 +49,13 @@ class Emission:
     topic: str = ""
     incomplete: bool = False
     source_ns: int = 0
+
+    def __repr__(self) -> str:
+        """One line: when, of what, and the prediction."""
+        said = [f"{self.t_us:,} us", f"{self.n_events:,} events", f"{len(self.features):,} features"]
+        said += [f"{name!r}" for name in (self.topic, self.prediction) if name]
+        said += [name for name in ("final", "incomplete") if getattr(self, name)]
+        return f"Emission({', '.join(said)})"
 
     @property
     def prediction(self) -> str | None:
@@ -59,11 +70,15 @@ class Emission:
 
 @dataclass(frozen=True, slots=True)
 class EmitPolicy:
-    """How often features are read; never what they are.
+    """How often features are emitted; never what they are.
 
     `events`: after every `every` events. `time`: whenever stream time passes a multiple of `every`
-    microseconds, counted from the origin. `auto`: as often as reading takes no more than a fifth of the
-    time. At the end of a labelled sample there is a reading under every policy.
+    microseconds, counted from the origin. `auto`: as often as emissions take no more than a fifth of the
+    time. At the end of a labelled sample there is an emission under every policy.
+
+    Example:
+        >>> sf.EmitPolicy.parse("10ms")
+        EmitPolicy(kind='time', every=10000)
     """
 
     kind: Literal["events", "time", "auto"]
@@ -74,7 +89,7 @@ class EmitPolicy:
         """Read `event`, `1000ev`, `10ms` (also `500us`, `2s`) or `auto`.
 
         Raises:
-            InputError: the text is none of these.
+            InputError: the text is something else.
         """
         if text == "auto":
             return cls("auto")

@@ -1,65 +1,55 @@
 """The asynchronous pipeline: source, processor and sinks, joined by bounded queues.
 
-Lives here: every task and queue of the package, pacing, and ending well.
-Not here: what is computed (`session`, `cameras`), read (`recording`, `live`) or written (`sinks`).
+Lives here: its tasks and queues, and ending well.
+Not here: what is computed (`session`, `cameras`), read (`recordings`, `live`) or written (`sinks`); pace and
+groups (`pacing`), threads (`threads`), signals (`signals`).
 
-Three tasks: one reads and decodes, one runs the kernels, one writes. Blocking work happens in a thread of
-each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full, whoever
-fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live source cannot
-make a camera wait: it has an inbox of its own, which says what it does when it is full (`live.inbox`).
+Three tasks (`_Stages`): one reads and decodes, one runs the kernels, one writes. Blocking work happens in a
+thread of each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full,
+the task that fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live
+source cannot make a camera wait: it has an inbox of its own, which says what happens when it is full
+(`live.inbox`).
 
-A live source also says when nothing more is there. If nothing is under way either, the thread that reads
-processes and writes what it has by itself: there is nobody to work beside, and each hop between threads and
-the loop costs about a tenth of a millisecond, more on a machine that has other things to do.
+A live source also says when nothing more is there. If nothing is under way either, the thread that reads also
+processes and writes (`_Bypass`): no other thread has anything to do meanwhile, and each hop between
+threads and the loop costs about a tenth of a millisecond, more on a machine that is busy.
 
 Ending: when the source is exhausted or `stop` is set, what is in the queues is processed and the sinks are
-closed. When a task fails, the others are cancelled and the sinks are closed as failed.
+closed. When a task fails or `run` is cancelled, the tasks end as soon as their threads return, and the sinks
+are closed as failed. Sinks are closed in a thread, and after all others have ended.
 """
 
 import asyncio
-import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field
 from itertools import islice
-from threading import current_thread, main_thread
-from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
-from streamfeat.messages.packets import Label, Packet
+from streamfeat.stream.pacing import Group, In, Pace, groups_of, stream_time
 from streamfeat.stream.sinks import Sink
+from streamfeat.stream.threads import Threads
 
-__all__ = ["Pipeline", "PipelineStats", "Processor", "run_until_interrupted", "signals_wait"]
+__all__ = ["Pipeline", "PipelineStats", "Processor"]
 
-In = TypeVar("In")
 Out = TypeVar("Out")
 Taken = TypeVar("Taken", contravariant=True)
 Made = TypeVar("Made", covariant=True)
 
 _QUEUE_ITEMS = 8
-_EVENTS_A_HOP = 32_768
-"""Items are handed on in groups of about so many events: a hop between threads costs 50 to 100 us."""
-_ITEMS_A_HOP = 256
 _EMISSIONS_A_HOP = 256
-_PACED_SLICE_US = 10_000
-"""Paced packets are cut to this length of the clock, so that nothing waits for the end of a long packet."""
 
 
 @dataclass(slots=True)
 class PipelineStats:
-    """What is under way.
+    """How far a pipeline has got, and what waits in its queues.
 
     Attributes:
         items: items read from the source.
         queued_in: groups of items that wait for the processor, at most 8.
         queued_out: groups of emissions that wait for the sinks, at most 8.
-        dropped: items dropped; always 0, a full queue makes its producer wait.
-        stopped: the source was stopped before its end.
+        dropped: items dropped; always 0, for a full queue makes the task before it wait.
+        stopped: `stop` ended the source before its end.
     """
 
     items: int = 0
@@ -70,26 +60,36 @@ class PipelineStats:
 
 
 class Processor(Protocol[Taken, Made]):
-    """Makes something of each item; runs in a thread, one item at a time."""
+    """Makes something of each item; is called from one thread at a time."""
 
     def process(self, item: Taken, /) -> Iterator[Made]:
         """Take in one item, and yield what comes of it."""
 
     def finish(self) -> Iterator[Made]:
-        """The items have ended: yield what is left."""
+        """Yield what is left when the items have ended."""
 
     def rest(self) -> None:
-        """Nothing waits at the moment: a chance to work ahead, as long as one item takes at most."""
+        """Work ahead while no item waits, for no longer than one item takes."""
 
 
 class Pipeline(Generic[In, Out]):
-    """Runs items through a processor into sinks.
+    """Runs items through a processor into sinks, once.
+
+    Example:
+        >>> class Print:
+        ...     def write(self, emissions):
+        ...         print(sum(len(e.features) for e in emissions))
+        ...     def close(self, *, failed):
+        ...         print("failed" if failed else "done")
+        >>> session = sf.Session(encoder, sf.EmitPolicy.parse("1000ev"))
+        >>> asyncio.run(sf.Pipeline([], session, [Print()]).run())
+        done
 
     Args:
-        items: in stream order; iterated in a thread of its own. None says that nothing more is there at the
-            moment, so that what is need not wait.
+        items: packets and labels in stream order, such as `recording.items()`; iterated in a thread. A live
+            source gives None when nothing more is there at the moment, so that what is there need not wait.
         processor: what is done with them: a `Session`, for one.
-        sinks: written to in this order.
+        sinks: written to in this order, and closed in the reverse one.
         speed: stream seconds for each second of the clock; None for as fast as possible.
         on_progress: called on the event loop's thread after each group that is handed on, with stream time in
             microseconds.
@@ -110,239 +110,193 @@ class Pipeline(Generic[In, Out]):
         self._sinks = sinks
         self._speed = speed
         self._on_progress = on_progress
-        self._inbox: asyncio.Queue[list[In] | None] = asyncio.Queue(_QUEUE_ITEMS)
-        self._outbox: asyncio.Queue[list[Out] | None] = asyncio.Queue(_QUEUE_ITEMS)
-        self._stop = asyncio.Event()
-        self._has_ended = False
-        self._under_way = 0
-        self._stats = PipelineStats()
+        self._traffic: _Traffic[In, Out] = _Traffic()
 
     def stop(self) -> None:
         """End the source; what has been read is still processed and written. Call from the loop's thread."""
-        self._stop.set()
+        self._traffic.stop.set()
 
     def stats(self) -> PipelineStats:
         """A copy of the counts, with the present depth of the queues."""
-        return replace(self._stats, queued_in=self._inbox.qsize(), queued_out=self._outbox.qsize())
+        return self._traffic.stats()
 
     async def run(self) -> None:
-        """Run until the source ends or is stopped. Errors of any part come out as they were raised."""
-        with ExitStack() as closing:
-            for sink in self._sinks:
-                closing.push(partial(_close, sink))
-            # Threads end before sinks are closed: a cancelled write may still be under way in one.
-            with ThreadPoolExecutor(3, thread_name_prefix="streamfeat") as threads:
-                try:
-                    async with asyncio.TaskGroup() as tasks:
-                        tasks.create_task(self._read(threads))
-                        tasks.create_task(self._compute(threads))
-                        tasks.create_task(self._write(threads))
-                except BaseExceptionGroup as group:
-                    raise group.exceptions[0] from None
+        """Run until the source ends or is stopped.
 
-    async def _read(self, threads: ThreadPoolExecutor) -> None:
-        loop = asyncio.get_running_loop()
-        if self._speed is None:
-            groups = _full_groups(self._items)
-        else:
-            groups = _paced_groups(self._items, round(_PACED_SLICE_US * max(self._speed, 1.0)))
-        started: tuple[float, int] | None = None
-        while not self._stop.is_set():
+        Errors of any part come out as they were raised, but for those that an event loop would take for
+        something else, see `Threads.run`. Cancelling ends the pipeline as a failure; it takes as long as the
+        call of source, processor or sink that is under way.
+        """
+        failure: BaseException | None = None
+        with Threads(3) as threads:
+            bypass = _Bypass(self._processor, self._sinks, self._traffic, threads)
+            stages = _Stages(self._processor, self._sinks, self._traffic, threads)
             try:
-                group = await loop.run_in_executor(threads, self._advance, groups)
-            except asyncio.CancelledError:
-                self._has_ended = True
-                raise
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(
+                        stages.read(
+                            groups_of(self._items, self._speed), bypass, self._speed, self._on_progress
+                        )
+                    )
+                    tasks.create_task(stages.compute())
+                    tasks.create_task(stages.write())
+            except BaseExceptionGroup as group:
+                failure = group.exceptions[0]
+            except BaseException as error:
+                failure = error
+            try:
+                await threads.run(_close_all, self._sinks, failed=failure is not None)
+            except BaseException:
+                if failure is None:
+                    raise
+        if failure:
+            raise failure
+
+
+@dataclass(slots=True)
+class _Traffic(Generic[In, Out]):
+    """What is on its way through a pipeline; changed by its tasks, and by `_Bypass` when those are idle.
+
+    Attributes:
+        inbox: groups of items for the processor; None ends it.
+        outbox: emissions for the sinks; None ends it.
+        stop: set to end the source.
+        under_way: groups and parts that were handed on and are not done with.
+        items: items read.
+        stopped: the source was stopped before its end.
+    """
+
+    inbox: asyncio.Queue[list[In] | None] = field(default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS))
+    outbox: asyncio.Queue[list[Out] | None] = field(default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS))
+    stop: asyncio.Event = field(default_factory=asyncio.Event)
+    under_way: int = 0
+    items: int = 0
+    stopped: bool = False
+
+    def stats(self) -> PipelineStats:
+        return PipelineStats(self.items, self.inbox.qsize(), self.outbox.qsize(), 0, self.stopped)
+
+
+class _Stages(Generic[In, Out]):
+    """The three tasks of a pipeline."""
+
+    def __init__(
+        self,
+        processor: Processor[In, Out],
+        sinks: Sequence[Sink[Out]],
+        traffic: _Traffic[In, Out],
+        threads: Threads,
+    ) -> None:
+        self._processor, self._sinks = processor, sinks
+        self._traffic, self._threads = traffic, threads
+
+    async def read(
+        self,
+        groups: Iterator[Group[In]],
+        bypass: "_Bypass[In, Out]",
+        speed: float | None,
+        on_progress: Callable[[int], None],
+    ) -> None:
+        traffic = self._traffic
+        pace = Pace(speed)
+        while not traffic.stop.is_set():
+            group = await self._threads.run(bypass.next_group, groups)
             if group is None:
                 break
-            t_us = _stream_time(group)
-            if self._speed is not None and t_us is not None:
-                started = started or (time.monotonic(), t_us)
-                due = started[0] + (t_us - started[1]) / (1e6 * self._speed)
-                await self._sleep_until(due)
-            self._under_way += 1
-            await self._inbox.put(group)
-            self._stats.items += len(group)
+            t_us = stream_time(group)
+            if speed is not None and t_us is not None:
+                await self._sleep_until(pace.due(group[-1], t_us, time.monotonic()))
+            traffic.under_way += 1
+            await traffic.inbox.put(group)
+            traffic.items += len(group)
             if t_us is not None:
-                self._on_progress(t_us)
-        self._stats.stopped = self._stop.is_set()
-        await self._inbox.put(None)
-
-    def _advance(self, groups: "Iterator[_Group[In]]") -> list[In] | None:
-        """In the reader's thread: the next group to hand on. Does by itself what nobody need do beside it."""
-        while not (self._stop.is_set() or self._has_ended):
-            found = next(groups, None)
-            if found is None:
-                return None
-            # Others can only finish what they have: nobody but the reader gives them more.
-            if found.items and (found.more or self._under_way):
-                return found.items
-            emissions = self._emissions(found.items)
-            while part := _take(emissions):
-                for sink in self._sinks:
-                    sink.write(part)
-            self._stats.items += len(found.items)
-            if not self._under_way:
-                self._processor.rest()
-        return None
+                on_progress(t_us)
+        traffic.stopped = traffic.stop.is_set()
+        await traffic.inbox.put(None)
 
     async def _sleep_until(self, due: float) -> None:
         wait = due - time.monotonic()
         if wait > 0:
             try:
-                await asyncio.wait_for(self._stop.wait(), wait)
+                await asyncio.wait_for(self._traffic.stop.wait(), wait)
             except TimeoutError:
                 return
 
-    async def _compute(self, threads: ThreadPoolExecutor) -> None:
-        loop = asyncio.get_running_loop()
-        more = True
+    async def compute(self) -> None:
+        traffic, more = self._traffic, True
         while more:
-            group = await self._inbox.get()
+            group = await traffic.inbox.get()
             more = group is not None
-            emissions = self._emissions(group)
+            emissions = _emissions(self._processor, group)
             # One packet can give as many emissions as it has events: they are handed on in parts.
             full = True
             while full:
-                part = await loop.run_in_executor(threads, _take, emissions)
+                part = await self._threads.run(_take, emissions)
                 if part:
-                    self._under_way += 1
-                    await self._outbox.put(part)
+                    traffic.under_way += 1
+                    await traffic.outbox.put(part)
                 full = len(part) == _EMISSIONS_A_HOP
-            self._under_way -= 1
-        await self._outbox.put(None)
+            traffic.under_way -= 1
+        await traffic.outbox.put(None)
 
-    def _emissions(self, group: list[In] | None) -> Iterator[Out]:
-        if group is None:
-            yield from self._processor.finish()
-        else:
-            for item in group:
-                yield from self._processor.process(item)
-
-    async def _write(self, threads: ThreadPoolExecutor) -> None:
-        loop = asyncio.get_running_loop()
-        while (part := await self._outbox.get()) is not None:
+    async def write(self) -> None:
+        while (part := await self._traffic.outbox.get()) is not None:
             for sink in self._sinks:
-                await loop.run_in_executor(threads, sink.write, part)
-            self._under_way -= 1
+                await self._threads.run(sink.write, part)
+            self._traffic.under_way -= 1
 
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+class _Bypass(Generic[In, Out]):
+    """Processes and writes in the reader's thread, as long as the other two would only wait for it."""
+
+    def __init__(
+        self,
+        processor: Processor[In, Out],
+        sinks: Sequence[Sink[Out]],
+        traffic: _Traffic[In, Out],
+        threads: Threads,
+    ) -> None:
+        self._processor, self._sinks = processor, sinks
+        self._traffic, self._threads = traffic, threads
+
+    def next_group(self, groups: Iterator[Group[In]]) -> list[In] | None:
+        """The next group that the other tasks shall see to; None at the end, or when that has come early."""
+        while not (self._traffic.stop.is_set() or self._threads.cancelled):
+            found = next(groups, None)
+            if found is None:
+                return None
+            # The other tasks can only finish what they have: the reader alone gives them more.
+            if found.items and (found.more or self._traffic.under_way):
+                return found.items
+            emissions = _emissions(self._processor, found.items)
+            while part := _take(emissions):
+                for sink in self._sinks:
+                    sink.write(part)
+            self._traffic.items += len(found.items)
+            if not self._traffic.under_way:
+                self._processor.rest()
+        return None
 
 
-@contextmanager
-def signals_wait() -> Iterator[None]:
-    """SIGINT and SIGTERM wait until `run_until_interrupted` can hear them, or until the block ends.
-
-    For opening sinks: a signal between opening them and running would leave half an output behind.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _emissions(processor: Processor[In, Out], group: list[In] | None) -> Iterator[Out]:
+    if group is None:
+        yield from processor.finish()
+    else:
+        for item in group:
+            yield from processor.process(item)
 
 
-def run_until_interrupted(
-    pipelines: Sequence[Pipeline[In, Out]], interrupt: Callable[[], None] | None = None
-) -> bool:
-    """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
-
-    Args:
-        pipelines: none of which has run.
-        interrupt: what a signal does; if not given, it stops every pipeline.
-
-    Returns:
-        whether there was a signal.
-    """
-    interrupted = False
-
-    def on_signal() -> None:
-        nonlocal interrupted
-        interrupted = True
-        if interrupt:
-            interrupt()
-        else:
-            for pipeline in pipelines:
-                pipeline.stop()
-
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        # Only the main thread of a process can be told of signals.
-        names = _SIGNALS if current_thread() is main_thread() else ()
-        before = {name: signal.getsignal(name) for name in names}
-        for name in names:
-            loop.add_signal_handler(name, on_signal)
-        mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, names)
+def _close_all(sinks: Sequence[Sink[Out]], *, failed: bool) -> None:
+    """Close all, whatever becomes of each; once one has failed, the others close as failed."""
+    first: BaseException | None = None
+    for sink in reversed(sinks):
         try:
-            async with asyncio.TaskGroup() as tasks:
-                for pipeline in pipelines:
-                    tasks.create_task(pipeline.run())
-        except BaseExceptionGroup as group:
-            raise group.exceptions[0] from None
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            for name, handler in before.items():
-                loop.remove_signal_handler(name)
-                signal.signal(name, handler)
-
-    asyncio.run(run())
-    return interrupted
-
-
-def _close(
-    sink: Sink[Out],
-    kind: type[BaseException] | None,
-    value: BaseException | None,
-    trace: TracebackType | None,
-) -> None:
-    sink.close(failed=kind is not None)
+            sink.close(failed=failed or first is not None)
+        except BaseException as error:
+            first = first or error
+    if first:
+        raise first
 
 
 def _take(emissions: Iterator[Out]) -> list[Out]:
     return list(islice(emissions, _EMISSIONS_A_HOP))
-
-
-@dataclass(slots=True)
-class _Group(Generic[In]):
-    """Items that go together, none if there are none at the moment; `more` may be there already."""
-
-    items: list[In]
-    more: bool = True
-
-
-def _full_groups(items: Iterable[In | None]) -> Iterator[_Group[In]]:
-    group: list[In] = []
-    events = 0
-    for item in items:
-        if item is not None:
-            group.append(item)
-            events += len(item.events) if isinstance(item, Packet) else 0
-        if item is None or events >= _EVENTS_A_HOP or len(group) == _ITEMS_A_HOP:
-            yield _Group(group, more=item is not None)
-            group, events = [], 0
-    if group:
-        yield _Group(group)
-
-
-def _paced_groups(items: Iterable[In | None], slice_us: int) -> Iterator[_Group[In]]:
-    for item in items:
-        if item is None:
-            continue
-        if not isinstance(item, Packet) or len(item.events) == 0:
-            yield _Group([item])
-            continue
-        latest = np.maximum.accumulate(item.events["t"])
-        start = 0
-        while start < len(latest):
-            stop = int(np.searchsorted(latest, latest[start] + slice_us))
-            yield _Group([replace(item, events=item.events[start:stop])])
-            start = stop
-
-
-def _stream_time(group: Sequence[object]) -> int | None:
-    """The time by which a group is complete: that of its latest event."""
-    last = group[-1]
-    if isinstance(last, Label):
-        return last.start_us
-    return int(last.events["t"].max()) if isinstance(last, Packet) and len(last.events) else None

@@ -1,46 +1,52 @@
 """The main job on a recording: files in, emissions out, a summary at the end.
 
-Lives here: opening what a replay needs, running the pipeline until it ends or is interrupted, the result.
+Lives here: `ReplayJob`, which opens what a replay needs and sums up what happened; `replay` for programs.
 Not here: how it is computed (`session`, `pipeline`), how it looks (`sinks`, `cli`).
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
-from pathlib import Path
-from typing import Any, TextIO
-
-from rich.console import Console
+from typing import Any
 
 from streamfeat.classify.classifier import Classifier
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
-from streamfeat.events import make_events
-from streamfeat.files.locations import Location
+from streamfeat.recordings.opening import RecordingPath
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Label, Packet, Recording, open_recording
 from streamfeat.recordings.records import Losses
-from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted, signals_wait
+from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
+from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
+from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
-from streamfeat.stream.sinks import JsonLinesSink, RecordingSink, Sink, TerminalSink, open_sinks
-from streamfeat.stream.table import TableSink
+from streamfeat.stream.signals import run_until_interrupted, signals_wait
+from streamfeat.stream.sinks import Sink
+from streamfeat.stream.state import SessionStats
+from streamfeat.stream.warming import warm_up
 
-__all__ = ["ReplayJob", "items_of_split", "parse_speed", "warm_up"]
+__all__ = ["ReplayJob", "items_of_split", "parse_speed", "replay"]
+
+Report = Callable[[str, int, int, str], None]
 
 
 class ReplayJob:
     """One replay of one recording.
 
     Args:
-        recording: MCAP file.
-        model: of the encoder.
-        classifier: to predict with; none for features alone, or to learn from nothing with `learn_online`.
-        emit: when to read, see `EmitPolicy.parse`.
-        speed: a number for a multiple of the recorded pace, or `max`.
+        recording: path or URL; or an open recording, which is not closed here.
+        model: path of the encoder, or the encoder.
+        classifier: path of one to predict with, or the classifier; without it there are features alone, and
+            `learn_online` starts from nothing.
+        emit: when to emit, see `EmitPolicy.parse`.
+        speed: stream seconds for each second of the clock; None for as fast as possible.
         topic: event topic, where there are several.
+        reading: how to read the recording.
         split: replay only samples of this split.
+        loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
 
@@ -50,37 +56,40 @@ class ReplayJob:
 
     def __init__(
         self,
-        recording: Location,
-        model: Path,
-        classifier: Path | None = None,
+        recording: RecordingPath | Recording,
+        model: ModelSource,
+        classifier: ClassifierSource | None = None,
         *,
-        emit: str = "auto",
-        speed: str = "max",
+        emit: str | EmitPolicy = "auto",
+        speed: float | None = None,
         topic: str | None = None,
+        reading: ReadOptions = AS_IT_IS,
         split: str | None = None,
+        loop: bool = False,
         learn_online: bool = False,
         engine: Callable[..., Engine] = Engine,
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
-        policy = EmitPolicy.parse(emit)
-        self._speed = parse_speed(speed)
-        self._split = split
-        self._topic = topic
-        self._recording = recording
-        encoder = Encoder.load(model)
-        reader = Classifier.load(classifier) if classifier else None
-        with open_recording(recording, topic) as rec:
-            encoder.geometry.grid_shape(rec.resolution)
+        self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+        self._speed = checked_speed(speed)
+        self._split, self._loop = split, loop
+        self._opening: Callable[[], AbstractContextManager[Recording]]
+        if isinstance(recording, Recording):
+            self._opening = lambda: nullcontext(recording)  # it stays open, for it was opened elsewhere
+        else:
+            self._opening = partial(open_recording, recording, topic, reading)
+        self._encoder, reader = open_models(model, classifier)
+        with self._opening() as rec:
+            self.assumptions = rec.assumptions
+            self._encoder.geometry.grid_shape(rec.resolution)
             if learn_online and reader is None:
-                reader = Classifier.untrained([label.label for label in rec.labels], encoder)
+                reader = Classifier.untrained([label.label for label in rec.labels], self._encoder)
             if split is not None and split not in {label.split for label in rec.labels}:
-                raise InputError(f"{recording}: has no samples of split {split!r}")
-        if reader:
-            reader.check_fits(encoder, path=classifier or "the classifier")
-        self._shape_of_emissions = encoder.n_features, reader.labels if reader else ()
+                raise InputError(f"{rec.path}: has no samples of split {split!r}")
+        self._labels = reader.labels if reader else ()
         self._session = Session(
-            encoder,
-            policy,
+            self._encoder,
+            self._policy,
             reader,
             learn_online=learn_online,
             clock=time.perf_counter,
@@ -89,51 +98,60 @@ class ReplayJob:
         self._seconds = 0.0
         self.interrupted = False
         self._played: Recording | None = None
+        self._pipeline: Pipeline[Packet | Label, Emission] | None = None
+        self._report: Report = lambda step, done, total, remark: None
+
+    @contextmanager
+    def opened(
+        self, sinks: Callable[[], Sequence[Sink[Emission]]]
+    ) -> Iterator[Pipeline[Packet | Label, Emission]]:
+        """The pipeline of this replay into some sinks, with the recording open as long as the block runs."""
+        if self._speed is not None:
+            warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        with self._opening() as rec:
+            self._played = rec
+            played = rec.played(
+                loop=self._loop, report=lambda n, total: self._report("replaying", n, total, "")
+            )
+            items = items_of_split(played, self._split)
+            self._pipeline = Pipeline(items, self._session, sinks(), speed=self._speed)
+            yield self._pipeline
 
     def run(
         self,
-        *,
-        console: Console | None = None,
-        every_sample: bool = False,
-        recording_out: Path | None = None,
-        json_lines: Path | TextIO | None = None,
-        with_features: bool = False,
-        table: Path | None = None,
-        more: Sink[Emission] | None = None,
-        loop: bool = False,
-        report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
+        outputs: Outputs = NO_OUTPUTS,
+        report: Report = lambda step, done, total, remark: None,
     ) -> None:
         """Replay to the end, or to the first SIGINT or SIGTERM, which loses nothing already read.
 
         Args:
-            console: for live lines.
-            every_sample: a line for each labelled sample, however fast they come.
-            recording_out: MCAP file for features and predictions; replaced if it exists.
-            json_lines: file (replaced) or open stream for a JSON line for each emission.
-            with_features: include features in JSON lines.
-            table: Arrow or Parquet file for emissions, see `TableSink`; replaced if it exists.
-            more: one sink more.
-            loop: start again at the end, with times that go on.
+            outputs: where emissions go.
             report: called with (step, done, of how many, remark) as packets and labels are read, from a
                 thread.
+
+        Raises:
+            InputError: an output cannot be written, or the recording not be read.
         """
-        with open_recording(self._recording, self._topic) as rec, signals_wait():
-            self._played = rec
-            sinks = open_sinks(
-                partial(TerminalSink, console, every_sample=every_sample) if console else None,
-                partial(JsonLinesSink, json_lines, features=with_features) if json_lines else None,
-                partial(_recording_sink, recording_out) if recording_out else None,
-                partial(TableSink, table, *self._shape_of_emissions) if table else None,
-                (lambda: more) if more else None,
-            )
-            played = rec.played(loop=loop, report=lambda n, total: report("replaying", n, total, ""))
-            items = items_of_split(played, self._split)
-            pipeline: Pipeline[Packet | Label, Emission] = Pipeline(
-                items, self._session, sinks, speed=self._speed
-            )
-            started = time.perf_counter()
-            self.interrupted = run_until_interrupted([pipeline])
-            self._seconds = time.perf_counter() - started
+        self._report = report
+        with ExitStack() as held:
+
+            def sinks() -> Sequence[Sink[Emission]]:
+                held.enter_context(signals_wait())
+                return outputs.open(self._encoder.n_features, self._labels)
+
+            with self.opened(sinks) as pipeline:
+                started = time.perf_counter()
+                self.interrupted = run_until_interrupted([pipeline])
+                self._seconds = time.perf_counter() - started
+
+    def stop(self) -> None:
+        """Read no more; what has been read is still processed. Call from the loop's thread."""
+        if self._pipeline:
+            self._pipeline.stop()
+
+    def session_stats(self) -> SessionStats:
+        """What has been done so far; may be called from another thread."""
+        return self._session.stats()
 
     @property
     def losses(self) -> Losses:
@@ -141,7 +159,7 @@ class ReplayJob:
         return self._played.losses if self._played else Losses()
 
     def drops(self) -> dict[str, int]:
-        """What did not come to bear so far, by reason; may be called from another thread."""
+        """What was not used so far, by reason; may be called from another thread."""
         stats = self._session.stats()
         return {
             "dropped": 0,
@@ -165,7 +183,10 @@ class ReplayJob:
             result["accuracy"] = round(stats.correct / stats.samples, 4)
         if stats.unknown_labels:
             result["unknown_labels"] = stats.unknown_labels
-        return result | self.drops() | {"saturated": stats.saturated, "interrupted": self.interrupted}
+        removed = dict(self.losses.removed)
+        return (
+            result | self.drops() | removed | {"saturated": stats.saturated, "interrupted": self.interrupted}
+        )
 
 
 def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterator[Packet | Label]:
@@ -178,20 +199,6 @@ def items_of_split(items: Iterable[Packet | Label], split: str | None) -> Iterat
             yield item
 
 
-def warm_up(encoder: Encoder, policy: EmitPolicy) -> None:
-    """Compile what the first packets would otherwise have to wait for."""
-    session = Session(encoder, policy)
-    side = encoder.geometry.patch * encoder.geometry.downsample
-    for _ in session.process(Packet("", make_events([0], [0], [1], [0]), (side, side), 0, 0)):
-        pass
-    for _ in session.finish():
-        pass
-
-
-def _recording_sink(path: Path) -> RecordingSink:
-    return RecordingSink(RecordingWriter(path, overwrite=True))
-
-
 def parse_speed(text: str) -> float | None:
     """Read a multiple of the recorded pace, or `max`, which is None.
 
@@ -201,9 +208,62 @@ def parse_speed(text: str) -> float | None:
     if text == "max":
         return None
     try:
-        speed = float(text)
-    except ValueError:
-        speed = 0.0
-    if not 0 < speed < 1e9:
-        raise InputError(f"--speed {text!r} is not understood; give a number above zero, or max")
+        return checked_speed(float(text))
+    except ValueError:  # an InputError is one, too
+        raise InputError(f"--speed {text!r} is not understood; give a number above zero, or max") from None
+
+
+def checked_speed(speed: float | None) -> float | None:
+    """The same speed.
+
+    Raises:
+        InputError: it is no number above zero, and not None.
+    """
+    if speed is not None and not 0 < speed < 1e9:
+        raise InputError(f"a speed of {speed} is not possible; give a number above zero, or None")
     return speed
+
+
+def replay(
+    recording: RecordingPath | Recording,
+    model: ModelSource,
+    classifier: ClassifierSource | None = None,
+    *,
+    emit: str | EmitPolicy = "auto",
+    speed: float | None = None,
+    topic: str | None = None,
+    split: str | None = None,
+    loop: bool = False,
+    learn_online: bool = False,
+) -> EmissionStream:
+    """Replay a recording as an asynchronous iterator of emissions, those that `streamfeat replay` makes.
+
+    Example:
+        >>> async def main():
+        ...     async for emission in sf.replay("digits.mcap", "model", "classifier", speed=None):
+        ...         if emission.final:
+        ...             print(emission.prediction, emission.sample.label)
+        >>> asyncio.run(main())  # in Jupyter: await main()
+
+    Args:
+        recording: path or URL; or an open recording, which stays open and is read in a thread meanwhile.
+        model: path of the encoder, or the encoder.
+        classifier: path of a classifier, or the classifier; features alone without it.
+        emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
+        speed: stream seconds for each second of the clock; None for as fast as the program takes them.
+        topic: event topic, where there are several.
+        split: replay only samples of this split.
+        loop: start again at the end, with times that go on.
+        learn_online: learn from each labelled sample after predicting it.
+
+    Returns:
+        the stream; nothing is opened before it is used. Iterating raises InputError where a file cannot be
+        used or the parts do not fit each other.
+
+    Raises:
+        InputError: `emit` or `speed` makes no sense.
+    """
+    policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+    options: dict[str, Any] = {"topic": topic, "split": split, "loop": loop, "learn_online": learn_online}
+    options |= {"emit": policy, "speed": checked_speed(speed)}
+    return EmissionStream(lambda: ReplayJob(recording, model, classifier, **options))

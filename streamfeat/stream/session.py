@@ -1,6 +1,6 @@
 """From the items of a stream to emissions, one item at a time and synchronously.
 
-Lives here: which engine an event goes to, where labelled samples begin and end, when features are read,
+Lives here: which engine an event goes to, where labelled samples begin and end, when emissions are made,
 predicting and, on request, learning from labels.
 Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, where one is needed, is given.
 """
@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.kernel import KernelClassifier
+from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution
@@ -29,26 +31,36 @@ _TRACE = 32
 _AHEAD_COLUMNS = 4096
 """Operator columns that are added at most to look ahead of a bin boundary: a fraction of a millisecond."""
 _AUTO_REST = 4.0
-"""Under `auto`, time that passes after a reading, in multiples of what that reading took."""
+"""Under `auto`, time that passes after an emission, in multiples of what that emission took."""
 
 
 class Session:
-    """Feeds one camera's packets and labels to an engine, and reads it as the policy says.
+    """Feeds one camera's packets and labels to an engine, and emits features as the policy says.
 
     A labelled sample starts with an empty window and its own origin, so its features are those of the
     offline path. Packets of another resolution start a new engine, packets of another epoch an empty window.
-    Whoever is behind reads as `auto` does until it has caught up, whatever the policy: events are not dropped
-    for readings. Readings of a window that packets are missing from are marked.
+    A session that is behind emits as `auto` does until it has caught up, whatever the policy: it leaves out
+    emissions and drops no events. Emissions of a window that packets are missing from are marked.
+
+    Example:
+        >>> session = sf.Session(encoder, sf.EmitPolicy.parse("10ms"), clock=time.perf_counter)
+        >>> with sf.open_recording("digits.mcap") as recording:
+        ...     for item in recording.items():
+        ...         for emission in session.process(item):
+        ...             print(emission.t_us, emission.features.sum())
+        >>> final = list(session.finish())
 
     Args:
         encoder: the frozen encoder.
-        policy: when to read.
-        classifier: predicts from each reading.
+        policy: when to emit.
+        classifier: predicts at each emission; of one with a kernel the linear one beside it where each event
+            has an emission, or where it learns online.
         learn_online: learn from each labelled sample after predicting it (prequential).
-        clock: seconds, monotonic; used by the `auto` policy and by those who are behind.
+        clock: seconds, monotonic; used by the `auto` policy, and by a session that is behind.
         topic: named in emissions.
-        is_behind: tells from `log_time_ns` of the packet in hand whether it has waited too long.
-        engine: makes the engines, as `Engine` does; another kind may watch what is done with one.
+        is_behind: whether the packet in hand has waited too long, given its `log_time_ns`.
+        engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
+        denoising: noise that is taken out before anything is counted; no part of a snapshot.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -58,37 +70,39 @@ class Session:
         self,
         encoder: Encoder,
         policy: EmitPolicy,
-        classifier: Classifier | None = None,
+        classifier: Classifier | KernelClassifier | None = None,
         *,
         learn_online: bool = False,
         clock: Callable[[], float] = lambda: 0.0,
         topic: str = "",
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
+        denoising: Denoising | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
         self.policy = policy
-        self.learner = OnlineClassifier(classifier) if classifier and learn_online else None
+        self._every_event = policy == EmitPolicy("events", 1)
+        if classifier and (learn_online or self._every_event):
+            classifier = classifier.linear
+        self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock = clock
-        self._topic = topic
+        self._clock, self._topic = clock, topic
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
-        self._every_event = policy == EmitPolicy("events", 1)
+        self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
-        self._log_time_ns = 0
-        self._source_ns = 0
+        self._log_time_ns = self._source_ns = 0
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
-    def classifier(self) -> Classifier | None:
+    def classifier(self) -> Classifier | KernelClassifier | None:
         """The classifier as it is now."""
         return self.learner.classifier if self.learner else self._classifier
 
@@ -115,10 +129,7 @@ class Session:
         Raises:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
-        every_us, before = self._state.every_us, snapshot.state
-        self._state = replace(before, every_us=every_us)
-        if before.every_us != every_us:
-            self._state.next_us = None
+        self._state = snapshot.state.resumed(self._state.every_us)
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -127,38 +138,35 @@ class Session:
             self._engine_for(snapshot.resolution).restore(snapshot.engine)
 
     def process(self, item: StreamItem) -> Iterator[Emission]:
-        """Take in one item of the stream, and yield what is read on the way."""
+        """Take in one item of the stream, and yield the emissions on the way."""
+        if self.denoiser:
+            item = self.denoiser.process(item)
         if isinstance(item, Watermark):
             self._source_ns = 0
             yield from self._pass_time(item.t_us)
-            return
-        if isinstance(item, Label):
+        elif isinstance(item, Label):
             yield from self._finish_sample()
-            self._state.sample, self._state.seen_label = item, True
-            self._start_anew(item.start_us)
-            return
-        if self._state.epoch not in (None, item.epoch):
-            yield from self._finish_sample()
-            self._start_anew(0)
-            self._state.lost = True
-        self._state.epoch = item.epoch
-        self._state.lost |= item.lost > 0
-        self._log_time_ns, self._source_ns = item.log_time_ns, item.source_ns
-        events = item.events
+            self._state.open_sample(item)
+            self._restart()
+        else:
+            yield from self._process_packet(item)
+
+    def _process_packet(self, packet: Packet) -> Iterator[Emission]:
+        state = self._state
+        if packet.epoch != state.epoch:
+            yield from self._enter_epoch(packet.epoch)
+        state.lost |= packet.lost > 0
+        self._log_time_ns, self._source_ns = packet.log_time_ns, packet.source_ns
+        events = packet.events
         if len(events) == 0:
             return
-        engine = self._engine_for(item.resolution)
-        sound = _sound(events, item.resolution)
-        latest = self._stream_times(events, sound)
-        if self._state.lost:
-            # What is missing came before this packet, so it has left the window one window after it.
-            self._state.incomplete_us = max(self._state.incomplete_us, int(latest[0]) + self._window_us)
-            self._state.lost = False
+        engine = self._engine_for(packet.resolution)
+        valid = _valid(events, packet.resolution)
+        latest = state.place(events["t"], valid, self._window_us)
         end = len(events)
-        if self._state.sample:
-            stop = self._state.sample.start_us + self._state.sample.duration_us
-            end = int(np.searchsorted(latest, stop))
-            early = sound[:end] & (events["t"][:end] < self._state.sample.start_us)
+        if state.sample and state.sample_end_us is not None:
+            end = int(np.searchsorted(latest, state.sample_end_us))
+            early = valid[:end] & (events["t"][:end] < state.sample.start_us)
             if early.any():
                 self._stats.late += int(np.count_nonzero(early))
                 kept = np.concatenate([~early, np.ones(len(events) - end, np.bool_)])
@@ -169,52 +177,43 @@ class Session:
             yield from self._feed(engine, events[end:], latest[end:])
 
     def rest(self) -> None:
-        """Nothing waits: bring the engine up to date for the next reading, for half of the time at most."""
+        """Look ahead to the next emission while no item waits, for half of the time at most."""
         now = self._clock()
         if self._engine and self.policy.kind != "auto" and now >= self._ahead_from:
             self._engine.prepare(_AHEAD_COLUMNS)
             self._ahead_from = now + 2 * (self._clock() - now)
 
     def finish(self) -> Iterator[Emission]:
-        """End the stream: the open sample is read, and what was collected is learned."""
+        """End the stream: the open sample has its final emission, and what was collected is learned."""
         self._source_ns = 0
         yield from self._finish_sample()
         if self._state.unread and self._engine:
-            yield self._read(self._engine, self._state.last_us + 1)
+            yield self._emit(self._engine, self._state.last_us + 1)
         if self.learner:
             self.learner.flush()
 
-    def _start_anew(self, origin_us: int) -> None:
-        """Begin with an empty window whose bins start at the origin."""
-        self._state.origin_us = origin_us
-        self._state.last_us = origin_us
-        self._state.next_us = None
-        self._state.unread = 0
-        self._state.silent_us = self._state.incomplete_us = BEFORE_TIME
+    def _enter_epoch(self, epoch: int) -> Iterator[Emission]:
+        if self._state.epoch is None:
+            self._state.epoch = epoch
+            return
+        yield from self._finish_sample()
+        self._state.begin_epoch(epoch)
+        self._restart()
+
+    def _restart(self) -> None:
         if self._engine:
-            self._engine.restart(origin_us)
+            self._engine.restart(self._state.origin_us)
 
     def _pass_time(self, t_us: int) -> Iterator[Emission]:
-        """Read what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
-        sample, engine = self._state.sample, self._engine
-        if sample and t_us >= sample.start_us + sample.duration_us:
+        """Emit what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
+        state, engine = self._state, self._engine
+        if state.sample_end_us is not None and t_us >= state.sample_end_us:
             yield from self._finish_sample()
-        if engine is None or (self._state.seen_label and not self._state.sample):
+        if engine is None or state.is_between_samples:
             return
-        every = self._state.every_us
-        if self._state.next_us is None:
-            self._state.next_us = self._following(self._state.last_us, every)
-        while (due := self._due(t_us, every)) <= t_us:
-            yield self._read(engine, due)
-            self._state.next_us = due + every
-            self._state.silent_us = due
-
-    def _stream_times(self, events: Events, sound: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Stream time after each event: it never goes back, and events that will be rejected have no say."""
-        t = events["t"]
-        if not sound.all():
-            t = np.where(sound, t, BEFORE_TIME)
-        return np.maximum(np.maximum.accumulate(t), self._state.last_us)
+        while (due := state.due_in_silence(t_us, self._window_us)) <= t_us:
+            yield self._emit(engine, due)
+            state.pass_due(due, in_silence=True)
 
     def _engine_for(self, resolution: Resolution) -> Engine:
         if self._engine and self._engine.resolution == resolution:
@@ -241,16 +240,16 @@ class Session:
     def _trace(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
     ) -> Generator[Emission, None, int]:
-        """One emission an event, until all is done or others wait; tells how many were followed.
+        """One emission an event, until all are done or other items wait; returns how many were followed.
 
         Some events at a time, because that many calls from Python would cost far more.
         """
         start, before = 0, self._stats.events
-        self._state.next_us = None
+        self._state.forget_due()
         while start < len(events) and not self._is_behind(self._log_time_ns):
             traced = slice(start, min(start + _TRACE, len(events)))
             features, accepted = engine.trace(events[traced])
-            self._state.last_us = max(self._state.last_us, int(latest[traced][-1]))
+            self._state.take(0, int(latest[traced][-1]))
             times, scores = latest[traced].tolist(), self._scores(features)
             for i, n_events in enumerate(accepted.tolist()):
                 yield self._emission(times[i] + 1, before + n_events, features[i], scores[i])
@@ -272,9 +271,7 @@ class Session:
         *,
         final: bool = False,
     ) -> Emission:
-        # After a silence that was read, stream time as told by events may lie behind it.
-        t_us = max(t_us, self._state.silent_us)
-        incomplete = t_us <= self._state.incomplete_us
+        t_us, incomplete = self._state.emit(t_us)
         self._stats.emissions += 1
         self._stats.incomplete += incomplete
         classifier = self.classifier
@@ -293,65 +290,48 @@ class Session:
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)
-        self._state.next_us = None
+        self._state.forget_due()
         now = self._clock()
         if now >= self._rest_until:
-            yield self._read(engine, self._state.last_us + 1)
+            yield self._emit(engine, self._state.last_us + 1)
             spent = self._clock() - now
             self._rest_until = now + spent * (1 + _AUTO_REST)
 
     def _feed_by_count(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
     ) -> Generator[Emission, None, int]:
-        """Feed and read until all is done, or others wait; tells how many were fed."""
+        """Feed and emit until all are done, or other items wait; returns how many were fed."""
         start = 0
-        self._state.next_us = None
+        self._state.forget_due()
         while start < len(events) and not self._is_behind(self._log_time_ns):
             stop = min(start + max(self.policy.every - self._state.unread, 1), len(events))
             self._take(engine, events[start:stop], latest[start:stop])
             start = stop
             if self._state.unread >= self.policy.every:
-                yield self._read(engine, self._state.last_us + 1)
+                yield self._emit(engine, self._state.last_us + 1)
         return start
 
     def _feed_by_time(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
     ) -> Generator[Emission, None, int]:
-        """Feed and read until all is done, or others wait; tells how many were fed."""
+        """Feed and emit until all are done, or other items wait; returns how many were fed."""
         start = 0
         while start < len(events) and not self._is_behind(self._log_time_ns):
-            due = self._due(int(latest[start]), self.policy.every)
+            due = self._state.due(int(latest[start]), self._window_us)
             stop = int(np.searchsorted(latest, due))
             if stop > start:
                 self._take(engine, events[start:stop], latest[start:stop])
                 start = stop
             else:
-                yield self._read(engine, due)
-                self._state.next_us = due + self.policy.every
+                yield self._emit(engine, due)
+                self._state.pass_due(due)
         return start
-
-    def _following(self, t_us: int, every: int) -> int:
-        return t_us - (t_us - self._state.origin_us) % every + every
-
-    def _due(self, t_us: int, every: int) -> int:
-        """When to read next, given stream time `t_us`; readings of an empty window are passed over."""
-        following = self._following(t_us, every)
-        if self._state.next_us is None:
-            self._state.next_us = following
-        # After this nothing changes until the next event. Between labelled samples nobody asks.
-        silent = self._state.last_us + (
-            0 if self._state.seen_label and not self._state.sample else self._window_us + every
-        )
-        if self._state.next_us > silent and not self._state.unread:
-            self._state.next_us = following
-        return self._state.next_us
 
     def _take(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> None:
         engine.feed(events)
-        self._state.unread += len(events)
-        self._state.last_us = max(self._state.last_us, int(latest[-1]))
+        self._state.take(len(events), int(latest[-1]))
 
-    def _read(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
+    def _emit(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
         engine.advance(t_us - 1)
         features = engine.features()
         self._state.unread = 0
@@ -365,7 +345,7 @@ class Session:
         self._stats.samples += 1
         geometry = self.encoder.geometry
         engine = self._engine or self._engine_for((geometry.patch * geometry.downsample,) * 2)
-        emission = self._read(engine, sample.start_us + sample.duration_us, final=True)
+        emission = self._emit(engine, sample.start_us + sample.duration_us, final=True)
         if emission.correct and self._stats.correct is not None:
             self._stats.correct += 1
         if self.learner:
@@ -373,22 +353,19 @@ class Session:
                 self.learner.learn_one(emission.features, sample.label)
             else:
                 self._stats.unknown_labels += 1
-        self._state.sample = None
-        self._state.next_us = None
+        self._state.close_sample()
         yield emission
 
 
-def _sound(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
-    """Which events will not be rejected."""
+def _valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
+    """Which events an engine will not reject."""
     height, width = resolution
     x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
-    sound: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
-    return sound & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
+    valid: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
+    return valid & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:
     seen = engine.stats()
-    stats.events += seen.events
-    stats.late += seen.late
-    stats.rejected += seen.rejected
-    stats.saturated += seen.saturated
+    for name in ("events", "late", "rejected", "saturated"):
+        setattr(stats, name, getattr(stats, name) + getattr(seen, name))

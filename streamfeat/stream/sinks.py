@@ -44,7 +44,7 @@ def open_sinks(*makers: Callable[[], S] | None) -> list[S]:
     """Make the sinks that are wanted: all of them or, when one cannot be made, none is left open.
 
     Args:
-        makers: without arguments; what is None is not wanted.
+        makers: called without arguments; None stands for a sink that is not wanted.
     """
     with ExitStack() as opening:
         sinks: list[S] = []
@@ -102,7 +102,7 @@ class JsonLinesSink:
         """Write a line for each emission.
 
         Raises:
-            InputError: the disk is full, or whatever else keeps the target from being written.
+            InputError: the disk is full, or the target cannot be written for another reason.
         """
         lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
         with self._explaining():
@@ -131,7 +131,7 @@ class JsonLinesSink:
         try:
             yield
         except BrokenPipeError:
-            raise  # who reads has enough, as `head` has: no fault of anybody's
+            raise  # the reader has enough, as `head` has, and nothing is wrong
         except OSError as error:
             where = self._path or "standard output"
             raise InputError(f"{where}: cannot be written: {error.strerror}; is there room?") from None

@@ -1,13 +1,17 @@
-"""Where a session is in its stream, and all that it needs to go on from there.
+"""Where a session is in its stream, how it moves on, and all that it needs to go on from there.
 
-Lives here: `SessionState`, what a session has counted, `SessionSnapshot`; reading them from JSON, checked.
-Not here: the rules by which a session moves on (`session`), files.
+Lives here: `SessionState` and its transitions, what a session has counted, `SessionSnapshot`; reading them
+from JSON, checked.
+Not here: engines, policies and what is emitted (`session`), files.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
-from streamfeat.engine.engine import Snapshot
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.events import Resolution
 from streamfeat.files.json_fields import Fields
@@ -29,10 +33,10 @@ class SessionStats:
         late: older than the window, or than the labelled sample that was open.
         rejected: outside the sensor, or malformed.
         saturated: accepted without changing a clipped count.
-        emissions: readings made.
+        emissions: emissions made.
         incomplete: of those, how many lacked packets known to be missing from the window.
         samples: labelled samples that ended.
-        correct: of those, how many were predicted rightly; None without a classifier.
+        correct: of those, how many were predicted correctly; None without a classifier.
         unknown_labels: samples that could not be learned from, because the classifier lacks their label.
     """
 
@@ -59,17 +63,20 @@ class SessionStats:
 
 @dataclass(slots=True)
 class SessionState:
-    """Where a session is in its stream.
+    """Where a session is in its stream, and the rules by which it moves on.
+
+    Stream time never goes back within an epoch; an emission is due, under a policy of time and in silence, at
+    multiples of `every_us` from the origin.
 
     Attributes:
         origin_us: stream time at which bin 0 starts.
-        last_us: that events have reached.
-        next_us: of the next reading by time, or in silence; None if that follows from `last_us`.
-        every_us: between such readings.
-        unread: events since the latest reading.
+        last_us: stream time that events have reached.
+        next_us: when the next emission is due by time, or in silence; None if that follows from `last_us`.
+        every_us: stream time between such emissions.
+        unread: events since the latest emission.
         epoch: of the camera's clock; None before the first packet.
-        silent_us: up to which silence was read.
-        incomplete_us: up to which packets are known to be missing from the window.
+        silent_us: stream time up to which there were emissions in silence.
+        incomplete_us: stream time up to which packets are known to be missing from the window.
         lost: packets are missing before the next one.
         seen_label: labelled samples come with this stream.
         sample: the one that is open.
@@ -87,6 +94,101 @@ class SessionState:
     seen_label: bool = False
     sample: Label | None = None
 
+    def begin(self, origin_us: int) -> None:
+        """Start with an empty window whose bins start at the origin."""
+        self.origin_us = self.last_us = origin_us
+        self.next_us = None
+        self.unread = 0
+        self.silent_us = self.incomplete_us = BEFORE_TIME
+
+    def open_sample(self, sample: Label) -> None:
+        """A labelled sample starts, with an empty window and its own origin."""
+        self.sample, self.seen_label = sample, True
+        self.begin(sample.start_us)
+
+    def close_sample(self) -> None:
+        """The labelled sample has ended."""
+        self.sample = self.next_us = None
+
+    @property
+    def sample_end_us(self) -> int | None:
+        """Where the open sample ends; None outside of one."""
+        return self.sample.start_us + self.sample.duration_us if self.sample else None
+
+    @property
+    def is_between_samples(self) -> bool:
+        """Whether labelled samples come with this stream and none is open: silence tells nothing then."""
+        return self.seen_label and self.sample is None
+
+    def begin_epoch(self, epoch: int) -> None:
+        """Start anew with the camera's clock: an empty window, with nothing known of what came before."""
+        self.begin(0)
+        self.lost = True
+        self.epoch = epoch
+
+    def place(self, t: NDArray[np.int64], valid: NDArray[np.bool_], window_us: int) -> NDArray[np.int64]:
+        """Stream time after each event of a packet: it never goes back, and invalid events have no say.
+
+        What is missing came before this packet, so it has left the window one window after its first event.
+
+        Args:
+            t: `(n,)` int64 microseconds, n > 0; not changed.
+            valid: `(n,)` bool.
+            window_us: length of the window.
+        """
+        if not valid.all():
+            t = np.where(valid, t, BEFORE_TIME)
+        latest = np.maximum(np.maximum.accumulate(t), self.last_us)
+        if self.lost:
+            self.incomplete_us = max(self.incomplete_us, int(latest[0]) + window_us)
+            self.lost = False
+        return latest
+
+    def take(self, n_events: int, last_us: int) -> None:
+        """Events were fed that reach so far."""
+        self.unread += n_events
+        self.last_us = max(self.last_us, last_us)
+
+    def due(self, t_us: int, window_us: int) -> int:
+        """When the next emission is due, given stream time; those of an empty window are passed over."""
+        following = self._following(t_us)
+        if self.next_us is None:
+            self.next_us = following
+        # After this nothing changes until the next event; between labelled samples nothing is of interest.
+        quiet_us = self.last_us + (0 if self.is_between_samples else window_us + self.every_us)
+        if self.next_us > quiet_us and not self.unread:
+            self.next_us = following
+        return self.next_us
+
+    def due_in_silence(self, t_us: int, window_us: int) -> int:
+        """As `due`, where time passes without events: from the latest event on."""
+        if self.next_us is None:
+            self.next_us = self._following(self.last_us)
+        return self.due(t_us, window_us)
+
+    def pass_due(self, due_us: int, *, in_silence: bool = False) -> None:
+        """An emission was made when it was due."""
+        self.next_us = due_us + self.every_us
+        if in_silence:
+            self.silent_us = due_us
+
+    def forget_due(self) -> None:
+        """What follows is not emitted by time; the next due emission follows from stream time."""
+        self.next_us = None
+
+    def emit(self, t_us: int) -> tuple[int, bool]:
+        """The stream time of an emission, and whether packets are known to be missing from its window."""
+        # After emissions in silence, stream time as told by events may lie behind them.
+        t_us = max(t_us, self.silent_us)
+        return t_us, t_us <= self.incomplete_us
+
+    def resumed(self, every_us: int) -> Self:
+        """A copy for a session with its own time between emissions."""
+        return replace(self, every_us=every_us, next_us=self.next_us if every_us == self.every_us else None)
+
+    def _following(self, t_us: int) -> int:
+        return t_us - (t_us - self.origin_us) % self.every_us + self.every_us
+
     @classmethod
     def from_json(cls, values: Fields) -> Self:
         """Read what `asdict` wrote, of a live stream.
@@ -99,10 +201,10 @@ class SessionState:
             values.whole("last_us", -_LATEST_US, _LATEST_US),
         )
         every_us = values.whole("every_us")
-        # One that lay far back would be followed by a reading for each step from there to now.
+        # One that lay far back would be followed by an emission for each step from there to now.
         next_us = values.maybe("next_us", last_us + 1, _LATEST_US)
         if next_us is not None and (every_us == 0 or (next_us - origin_us) % every_us):
-            raise InputError(f"{values.where}: no reading is due at {next_us} us")
+            raise InputError(f"{values.where}: no emission is due at {next_us} us")
         return cls(
             origin_us=origin_us,
             last_us=last_us,

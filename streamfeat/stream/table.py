@@ -28,8 +28,8 @@ class TableSink:
 
     Columns: `t_us`, `n_events`, `topic`, `incomplete`, `prediction` (null without a classifier), `scores` (in
     the order of the labels that the table's metadata have under `labels`), `label`, `split`, `source` and
-    `elapsed_us` of the labelled sample (null outside of one), `final` (the reading at the end of a sample,
-    the one that counts), and `features`, a list of fixed size. The file appears when it is complete.
+    `elapsed_us` of the labelled sample (null outside of one), `final` (the emission at the end of a sample,
+    the one that is scored), and `features`, a list of fixed size. The file appears when it is complete.
 
     Args:
         path: of the file; replaced if it exists.

@@ -52,6 +52,13 @@ SCHEMAS = {
         samples=_NUMBER,
         right=_NUMBER,
     ),
+    "engine": _object(
+        "streamfeat.Engine",
+        t_s=_NUMBER,
+        active_volumes=_NUMBER,
+        volumes=_NUMBER,
+        update_us=_object("update", median=_NUMBER, max=_NUMBER, n=_NUMBER),
+    ),
     "status": _object(
         "streamfeat.Status",
         t_s=_NUMBER,
@@ -59,9 +66,6 @@ SCHEMAS = {
         camera=_TEXT,
         events=_NUMBER,
         events_per_s=_NUMBER,
-        active_volumes=_NUMBER,
-        volumes=_NUMBER,
-        update_us=_object("update", median=_NUMBER, max=_NUMBER, n=_NUMBER),
         drops={"type": "object", "additionalProperties": _NUMBER},
     ),
 }
@@ -143,7 +147,7 @@ class LiveBoard(Board):
         about: see `Board`.
         name: of the server.
         port: on 127.0.0.1; 0 for any that is free.
-        on_viewer: called, in a thread of the server's, when somebody subscribes.
+        on_viewer: called, in a thread of the server's, when a client subscribes.
 
     Raises:
         InputError: the port cannot be used.
@@ -178,13 +182,13 @@ class LiveBoard(Board):
         return int(self._server.port)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Somebody looks: show what was shown last."""
+        """A client has subscribed: show what was shown last."""
         with suppress(KeyError):
             self._last[channel.topic]()
         self._on_viewer()
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        """Somebody looks no more."""
+        """A client has unsubscribed."""
 
     def close(self) -> None:
         """Stop the server; clients are told."""
@@ -196,8 +200,8 @@ class FileBoard(Board):
 
     Args:
         about: see `Board`.
-        path: written in place; whoever calls puts it where it belongs when it is complete.
-        name: where that is, for whoever reads an error.
+        path: written in place; the caller moves it when it is complete.
+        name: where to, for errors.
 
     Raises:
         InputError: it cannot be written.

@@ -46,7 +46,7 @@ def foxglove_layout(prefix: str, labels: Sequence[str], pooling: int) -> str:
     panels["Plot!latency"] = _plot(
         "Update latency",
         "microseconds",
-        [(f"{prefix}/status.update_us.{name}", name) for name in ("median", "max")],
+        [(f"{prefix}/engine.update_us.{name}", name) for name in ("median", "max")],
     )
     panels["Plot!rate"] = _plot(
         "Event rate", "events a second", [(f"{prefix}/status.events_per_s", "events a second")]

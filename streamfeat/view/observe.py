@@ -1,11 +1,11 @@
 """Watching an engine at work without getting in its way.
 
 Lives here: an engine that leaves a copy of what it sees now and then; how often; where the copy waits.
-Not here: pictures (`pictures`), and who looks at them (`sink`).
+Not here: pictures (`pictures`), and showing them (`sink`).
 
-An observed engine does what any engine does. After a reading, when the last look is long enough ago, it
-copies counts and activity, which takes about as long as reading after a few events does. A copy that nobody
-has taken when the next one comes is replaced and counted: whoever looks slowly sees fewer pictures.
+An observed engine does what any engine does. After an emission, when the last look is long enough ago, it
+copies counts and activity, which takes about as long as an emission after a few events. A copy that was not
+taken when the next one comes is replaced and counted: a slow viewer sees fewer pictures.
 """
 
 import time
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from streamfeat.engine.engine import Engine, EngineStats
 from streamfeat.events import Events, Resolution
 
-__all__ = ["ObservedEngine", "Pace", "Sight", "Slot", "Updates", "Watch"]
+__all__ = ["ObservedEngine", "Sight", "Slot", "Throttle", "Updates", "Watch"]
 
 _KEPT_EVENTS = 1 << 18
 """Events that a picture can be made of; more than a sensor shows in one bin, and 4 MB."""
@@ -33,7 +33,7 @@ class Updates:
     """How long bringing the features up to date took since the last look.
 
     Attributes:
-        n: readings, or events where features follow each event.
+        n: emissions, or events where features follow each event.
         median_us: microseconds; 0 without any.
         max_us: the longest; of events that are followed together, their mean counts.
     """
@@ -70,7 +70,7 @@ class Sight:
     updates: Updates
 
 
-class Pace:
+class Throttle:
     """So many times a second, of the clock or of the stream.
 
     Args:
@@ -102,7 +102,7 @@ class Slot:
         self.skipped = 0
 
     def put(self, sight: Sight) -> None:
-        """Leave a sight; one that nobody has taken is counted in `skipped`."""
+        """Leave a sight; the one before, if it was not taken, is counted in `skipped`."""
         self.skipped += len(self._waiting)
         self._waiting.append(sight)
 
@@ -119,7 +119,7 @@ class Watch:
     """How the engines of one camera are watched: what they are called, how often, who is told."""
 
     topic: str
-    pace: Pace
+    throttle: Throttle
     see: Callable[[Sight], None]
 
 
@@ -191,7 +191,7 @@ class ObservedEngine(Engine):
     def _look(self) -> None:
         window_us = self.window_us
         now_us = min(max(self._now_us, self._latest_us()), window_us[1])
-        if not self._watch.pace.is_due(now_us):
+        if not self._watch.throttle.is_due(now_us):
             return
         took = np.array(self._took_us or [0.0])
         updates = Updates(self._n_updates, float(np.median(took)), float(took.max()))

@@ -1,9 +1,9 @@
-"""From arrays to pictures that anybody can show.
+"""From arrays to pictures.
 
 Lives here: eight-bit pictures of events, bins and volumes; features in as many columns as a plot can have.
 Not here: where they are sent (`channels`), in which colours they are drawn (the page, Foxglove).
 
-Signed pictures have 128 for nothing, more for ON and less for OFF: whoever draws them chooses the colours.
+Signed pictures have 128 for nothing, more for ON and less for OFF; colours are chosen where they are drawn.
 """
 
 from collections.abc import Sequence

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.stream.emission import Emission
-from streamfeat.view.observe import Pace, Sight, Slot, Watch
+from streamfeat.view.observe import Sight, Slot, Throttle, Watch
 from streamfeat.view.pictures import bins_picture, event_picture, feature_columns, volume_picture
+from streamfeat.view.tap import EventTap, RecentEvents
 
 __all__ = ["Shows", "ViewSink", "about"]
 
@@ -31,16 +32,17 @@ class Shows(Protocol):
 
 
 class ViewSink:
-    """Shows what engines see and what is read from them, so many times a second and camera.
+    """Shows the events that pass, the state of engines, and emissions.
 
-    Where somebody looks on, sights wait in a slot for the thread that writes, and are drawn there: engines do
-    not wait. Where only a file is written, they are drawn as they come, so that none is missing.
+    Events are drawn in the thread that they pass in, as often as `rate` says. Where there may be viewers,
+    sights of engines wait in a slot for the thread that writes, and are drawn there: engines do not wait.
+    Where only a file is written, they are drawn as they come, so that none is missing.
 
     Args:
         boards: where everything is shown; may be filled later.
-        encoder: of the engines.
-        rate: looks a second.
-        live: of the clock, and for somebody who looks on; else of the stream.
+        encoder: of the engines; None where there is none, and events are all that is shown.
+        rate: pictures a second and camera.
+        live: by the clock, for viewers; else by stream time.
         prefix: of the channels, given the topic of the camera.
         drops: what was dropped so far, by reason.
     """
@@ -48,7 +50,7 @@ class ViewSink:
     def __init__(
         self,
         boards: Sequence[Shows],
-        encoder: Encoder,
+        encoder: Encoder | None,
         *,
         rate: float,
         live: bool,
@@ -62,8 +64,7 @@ class ViewSink:
         self._prefix = prefix
         self._drops = drops
         self._slots: dict[str, Slot] = {}
-        self._paces: dict[str, Pace] = {}
-        self._shown: dict[str, _Shown] = {}
+        self._throttles: dict[str, Throttle] = {}
         self._judged: dict[str, list[int]] = {}
         self.frames = 0
 
@@ -72,15 +73,22 @@ class ViewSink:
         """Sights that were replaced before they could be drawn."""
         return sum(slot.skipped for slot in list(self._slots.values()))
 
+    def tap(self) -> EventTap:
+        """What the items of the stream pass through on their way to the engines."""
+        return EventTap(self._throttle, self._show_events)
+
     def watch(self, topic: str) -> Watch:
         """How to watch the engines of a camera."""
         if self._live:
             slot = self._slots.setdefault(topic, Slot())
-            return Watch(topic, Pace(self._rate), slot.put)
-        return Watch(topic, Pace(self._rate, clock=None), self._draw)
+            return Watch(topic, self._throttle(), slot.put)
+        return Watch(topic, self._throttle(), self._draw)
+
+    def _throttle(self) -> Throttle:
+        return Throttle(self._rate) if self._live else Throttle(self._rate, clock=None)
 
     def write(self, emissions: Sequence[Emission]) -> None:
-        """Show what is due, and the reading at the end of each sample, which is the one that counts."""
+        """Show what is due, and the emission at the end of each sample, which is the one that is scored."""
         latest: dict[str, Emission] = {}
         for e in emissions:
             latest[e.topic] = e
@@ -98,50 +106,40 @@ class ViewSink:
                 self._tell(latest[topic])
 
     def close(self, *, failed: bool) -> None:
-        """Nothing is held open; boards belong to whoever opened them."""
+        """Do nothing; boards are closed where they were opened."""
 
     def _is_due(self, e: Emission) -> bool:
-        return self._paces.setdefault(e.topic, Pace(self._rate, clock=None)).is_due(e.t_us)
+        return self._throttles.setdefault(e.topic, Throttle(self._rate, clock=None)).is_due(e.t_us)
 
-    def _draw(self, sight: Sight) -> None:
-        geometry = self._encoder.geometry
-        t_us = sight.now_us
-        pictures = {
-            "events": event_picture(
-                sight.batches, sight.resolution, sight.window_us, sight.now_us, geometry.bin_us
-            ),
-            "bins": bins_picture(sight.counts, geometry.max_count),
-            "volumes": volume_picture(sight.activity),
-        }
-        status = self._status(sight)
-        for board in self._boards:
-            for name, picture in pictures.items():
-                board.picture(self._prefix(sight.topic), name, t_us, picture)
-            board.record(self._prefix(sight.topic), "status", t_us, status)
-
-    def _status(self, sight: Sight) -> dict[str, Any]:
-        shown = self._shown.setdefault(sight.topic, _Shown())
-        rate = shown.rate(sight)
+    def _show_events(self, seen: RecentEvents) -> None:
+        window_us = seen.now_us - seen.seen_us, seen.now_us + 1
+        picture = event_picture(seen.batches, seen.resolution, window_us, seen.now_us, seen.seen_us)
         self.frames += 1
-        return {
-            "t_s": sight.now_us / 1e6,
-            "frame": shown.frame,
-            "camera": sight.topic,
-            "width": sight.resolution[1],
-            "height": sight.resolution[0],
-            "events": shown.events,
-            "events_per_s": round(rate),
-            "active_volumes": int(np.count_nonzero(sight.activity)),
-            "volumes": sight.activity.size,
-            "update_us": {
-                "median": round(sight.updates.median_us, 2),
-                "max": round(sight.updates.max_us, 2),
-                "n": sight.updates.n,
-            },
+        status = {
+            "t_s": seen.now_us / 1e6,
+            "frame": seen.frame,
+            "camera": seen.topic,
+            "width": seen.resolution[1],
+            "height": seen.resolution[0],
+            "events": seen.events,
+            "events_per_s": round(seen.events_per_s),
             "drops": dict(self._drops()) | {"skipped": self.skipped},
         }
+        for board in self._boards:
+            board.picture(self._prefix(seen.topic), "events", seen.now_us, picture)
+            board.record(self._prefix(seen.topic), "status", seen.now_us, status)
+
+    def _draw(self, sight: Sight) -> None:
+        assert self._encoder
+        bins = bins_picture(sight.counts, self._encoder.geometry.max_count)
+        volumes = volume_picture(sight.activity)
+        for board in self._boards:
+            board.picture(self._prefix(sight.topic), "bins", sight.now_us, bins)
+            board.picture(self._prefix(sight.topic), "volumes", sight.now_us, volumes)
+            board.record(self._prefix(sight.topic), "engine", sight.now_us, _engine_record(sight))
 
     def _tell(self, e: Emission) -> None:
+        assert self._encoder
         columns = feature_columns(e.features, self._encoder.encoding, self._encoder.geometry.pooling)
         features = {
             "t_s": e.t_us / 1e6,
@@ -175,29 +173,24 @@ class ViewSink:
         }
 
 
-class _Shown:
-    """What was last shown of a camera."""
-
-    def __init__(self) -> None:
-        self.frame = 0
-        self.events = 0
-        self._of_engine = 0
-        self._now_us: int | None = None
-
-    def rate(self, sight: Sight) -> float:
-        """Events a second of stream time since the last sight, which this one becomes."""
-        passed_us = sight.now_us - self._now_us if self._now_us is not None else 0
-        # A sensor that becomes another one gets another engine, which counts from nothing.
-        before = self._of_engine if sight.stats.events >= self._of_engine else 0
-        new = sight.stats.events - before
-        self.frame += 1
-        self.events += new
-        self._now_us, self._of_engine = sight.now_us, sight.stats.events
-        return 1e6 * new / passed_us if passed_us > 0 else 0.0
+def _engine_record(sight: Sight) -> dict[str, Any]:
+    updates = sight.updates
+    return {
+        "t_s": sight.now_us / 1e6,
+        "active_volumes": int(np.count_nonzero(sight.activity)),
+        "volumes": sight.activity.size,
+        "update_us": {
+            "median": round(updates.median_us, 2),
+            "max": round(updates.max_us, 2),
+            "n": updates.n,
+        },
+    }
 
 
-def about(encoder: Encoder, labels: Sequence[str]) -> dict[str, str]:
-    """What does not change while a view lasts, as text by name."""
+def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
+    """What does not change while a view lasts, as text by name; nothing without an encoder."""
+    if encoder is None:
+        return {}
     geometry = encoder.geometry
     return {
         "formulation": encoder.formulation,

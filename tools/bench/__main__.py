@@ -1,9 +1,10 @@
-"""Measure streamfeat on this machine, and write `results.json`, the scaling picture and the README's tables.
+"""Measure streamfeat on this machine; write `results.json`, two pictures and the tables of the page.
 
-    python tools/bench --recording ncars.mcap            # everything, about ten minutes
+    python tools/bench --recording ncars.mcap            # everything; takes long
     python tools/bench --only floors,ingest              # these parts; others stay as they were
     python tools/bench --quick --json /tmp/quick.json    # does everything run? (figures mean nothing)
     python tools/bench --readme                          # tables from results.json, nothing is measured
+    python tools/bench --plan 100,0.1,400 --cores 16     # machines for 100 cameras of 0.1 Mev/s at K = 400
 
 Peers come with `pip install -e '.[bench]'`; those that are missing are named, and left out.
 """
@@ -21,13 +22,21 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
 
 import streamfeat as sf  # noqa: E402
+from streamfeat.events import Resolution  # noqa: E402
 from tools.bench import machine, material, tables  # noqa: E402
+from tools.bench.cluster import measure_cluster  # noqa: E402
 from tools.bench.direct import measure_floors, measure_peers  # noqa: E402
+from tools.bench.fleet_plan import PACKET_US, plan  # noqa: E402
 from tools.bench.floor import compiler  # noqa: E402
+from tools.bench.growth import measure_growth  # noqa: E402
+from tools.bench.growth_model import Constants  # noqa: E402
+from tools.bench.growth_picture import draw_growth  # noqa: E402
+from tools.bench.growth_streams import Load  # noqa: E402
 from tools.bench.ingest import measure_ingest  # noqa: E402
 from tools.bench.inverse import measure_inverse  # noqa: E402
 from tools.bench.kernel_rows import measure_kernels  # noqa: E402
 from tools.bench.latencies import measure_latency  # noqa: E402
+from tools.bench.overload import measure_overload  # noqa: E402
 from tools.bench.precision import measure_memory, measure_precision  # noqa: E402
 from tools.bench.replays import measure_replay  # noqa: E402
 from tools.bench.scaling import draw_scaling, measure_scaling  # noqa: E402
@@ -46,12 +55,20 @@ PARTS: dict[str, tuple[Callable[..., dict[str, Any]], str]] = {
     "learning": (measure_learning, "one online learning step"),
     "scaling": (measure_scaling, "cost against K, patch, bins and stride"),
     "kernels": (measure_kernels, "every kernel against its slow twin"),
+    "overload": (measure_overload, "ten times what --emit event carries, under --emit auto"),
+    "growth": (
+        measure_growth,
+        "cost of an event against K, stride, sensor, rate and cameras",
+    ),
+    "cluster": (measure_cluster, "learning and encoding on workers, some of them killed"),
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
+        if options.plan:
+            return _plan(options)
         return _rewrite_readme(options.json) if options.readme else _measure(options)
     except sf.InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -96,7 +113,17 @@ def _parser() -> argparse.ArgumentParser:
         default=material.DEFAULT_MODELS,
         help="folder that keeps learned models for the next run (default: %(default)s)",
     )
-    add("--readme", action="store_true", help="only write the README's tables from the results")
+    add("--readme", action="store_true", help="only write the tables of the page from the results")
+    add(
+        "--plan",
+        type=_cameras,
+        metavar="N,R,K",
+        help="machines for N cameras of R Mev/s at K filters",
+    )
+    add("--emit", choices=("event", "10ms"), default="10ms", help="with --plan (default: %(default)s)")
+    add("--stride", type=int, default=4, help="with --plan (default: %(default)s)")
+    add("--resolution", type=_resolution, default=(480, 640), metavar="HxW", help="with --plan")
+    add("--cores", type=int, default=os.cpu_count() or 1, help="with --plan: of a machine")
     return parser
 
 
@@ -133,6 +160,8 @@ def _measure(options: argparse.Namespace) -> int:
         _say(f"{seconds:.0f} s, the host took {100 * share:.0f} % of a processor")
     if "scaling" in wanted and "matplotlib" not in missing:
         draw_scaling(results["parts"]["scaling"], options.json.with_name("scaling.svg"))
+    if "growth" in wanted and "matplotlib" not in missing:
+        draw_growth(results["parts"]["growth"], options.json.with_name("growth.svg"))
     print("\n".join(tables.verdict_lines(results)))
     return 0
 
@@ -145,9 +174,32 @@ def _results_so_far(path: Path) -> dict[str, Any]:
 def _rewrite_readme(path: Path) -> int:
     if not path.exists():
         raise sf.InputError(f"{path}: there are no results yet; run python tools/bench first")
-    readme = ROOT / "README.md"
+    readme = Path(__file__).with_name("README.md")
     results = json.loads(path.read_text(encoding="utf-8"))
     readme.write_text(tables.insert(readme.read_text(encoding="utf-8"), results), encoding="utf-8")
+    return 0
+
+
+def _cameras(text: str) -> tuple[int, int, int]:
+    n, rate, filters = text.split(",")
+    return int(n), round(float(rate) * 1e6), int(filters)
+
+
+def _resolution(text: str) -> Resolution:
+    height, width = map(int, text.split("x"))
+    return height, width
+
+
+def _plan(options: argparse.Namespace) -> int:
+    """Machines for so many cameras, by the constants that the part `growth` found."""
+    growth = _results_so_far(options.json)["parts"].get("growth")
+    if growth is None:
+        raise sf.InputError(f"{options.json}: has no part growth; run python tools/bench --only growth")
+    n, rate, filters = options.plan
+    load = Load(options.emit, filters, options.stride, options.resolution, rate=rate)
+    packet_us = growth["fleet"]["packet_us"] or PACKET_US
+    events, constants = material.Material(options.recording), Constants(**growth["constants"])
+    print(json.dumps(plan(constants, packet_us, events, load, n, options.cores), indent=1))
     return 0
 
 

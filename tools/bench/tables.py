@@ -1,6 +1,6 @@
-"""Results as the tables of the README.
+"""Results as the tables of `tools/bench/README.md`.
 
-Lives here: Markdown from the JSON of a run, and the place in the README where it goes.
+Lives here: Markdown from the JSON of a run, and the place in the page where it goes.
 Not here: measuring; verdicts (`targets`).
 """
 
@@ -15,7 +15,7 @@ BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
 def insert(readme: str, results: dict[str, Any]) -> str:
-    """The README with the part between the markers made anew.
+    """The page with the part between the markers made anew.
 
     Raises:
         ValueError: the markers are not there.
@@ -23,7 +23,7 @@ def insert(readme: str, results: dict[str, Any]) -> str:
     before, begin, rest = readme.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
-        raise ValueError(f"the README has no {BEGIN} ... {END}")
+        raise ValueError(f"the page has no {BEGIN} ... {END}")
     return f"{before}{BEGIN}\n{markdown(results)}\n{END}{after}"
 
 
@@ -33,13 +33,13 @@ def read_between(readme: Path) -> str:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Everything that the README shows of a run."""
+    """Everything that the page shows of a run."""
     parts = results["parts"]
     blocks = [_machine(results), _targets(results)]
     blocks += [table(parts[name]) for name, table in TABLES.items() if name in parts]
     if "scaling" in parts:
         blocks.append(
-            "![Latency against K, patch, bins and stride](tools/bench/scaling.svg)\n\n"
+            "![Latency against K, patch, bins and stride](scaling.svg)\n\n"
             "The paper's table of complexity, measured: an update of the direct formulation costs O(K), "
             "whatever the patch and the bins; from scratch O(K d); the inverse formulation pays for its "
             "active atoms."
@@ -64,7 +64,7 @@ def _machine(results: dict[str, Any]) -> str:
         f"`{setting['recording']}` at K = {setting['n_filters']}, patch 12, {setting['n_bins']} bins. "
         "Contestants run in turns in one process; medians (10th to 90th percentile) of times, or of ratios "
         "inside a round; compilation and warm-up are not counted. `python tools/bench` measures it on "
-        "your machine; [`tools/bench/results.json`](tools/bench/results.json) has every figure."
+        "your machine; [`results.json`](results.json) has every figure."
     )
 
 
@@ -141,7 +141,7 @@ def _inverse(part: dict[str, Any]) -> str:
     ]
     return (
         "**Inverse formulation**: one event and volume, for three penalties; how many atoms a code uses "
-        "decides everybody's time.\n\n"
+        "decides the time of each.\n\n"
         + _table(("lambda0", "atoms in use", "", "time", "slower", "largest relative gap"), rows)
         + _missing(next(iter(part.values())))
     )
@@ -215,6 +215,62 @@ def _memory(part: dict[str, Any]) -> str:
     )
 
 
+def _overload(part: dict[str, Any]) -> str:
+    return (
+        f"**Overload**: `--emit event` takes in {part['event_carries_per_s']:,} events a second here. "
+        f"Offered {part['offered_per_s']:,} a second, `--emit auto` took in {part['accepted']:,} of "
+        f"{part['events']:,} in {part['seconds']:g} s (offered in {part['seconds_offered']:g} s), with "
+        f"{part['emissions']:,} emissions; {part['with_the_bits_of_the_offline_encoder']} of "
+        f"{part['compared']} that were compared have the bits of the offline encoder."
+    )
+
+
+def _cluster(part: dict[str, Any]) -> str:
+    if "missing" in part:
+        return ""
+    places = part["places"] | {
+        f"a worker of two killed while {step}": found for step, found in part["killed"].items()
+    }
+    rows = [
+        (
+            name,
+            f"{found['learn_s']:.1f}",
+            f"{found['encode_s']:.1f}",
+            f"{found.get('most_mb') or ''}",
+            "yes" if found["same"] else "NO",
+        )
+        for name, found in places.items()
+    ]
+    return f"**Workers**: {part['samples']:,} samples, K = 400.\n\n" + _table(
+        ("where", "learn, s", "encode, s", "most MB of a worker", "same bits"), rows
+    )
+
+
+def _growth(part: dict[str, Any]) -> str:
+    rows = []
+    for row in part["rows"]:
+        height, width = row["resolution"]
+        tails = [row.get(f"latency_{p}_us") for p in ("p50", "p99")]
+        rows.append(
+            (
+                f"`{row['emit']}`",
+                *(str(row[name]) for name in ("filters", "stride", "cameras")),
+                f"{width}x{height}",
+                f"{row['rate'] / 1e6:g}",
+                f"{row['ns']['p50']:,.0f}",
+                f"{row['predicted_ns']:,.0f}{' (fit)' if row['fitted'] else ''}",
+                *("" if tail is None else _short(tail) for tail in tails),
+            )
+        )
+    return (
+        "**Growth**: nanoseconds of the processor an event, measured, and predicted from what the kernels "
+        "have to do and two constants of the machine, which are fitted to the rows marked so; "
+        "then the latency of an event, or of an emission, in microseconds.\n\n"
+        + _table(("emit", "K", "stride", "cameras", "sensor", "Mev/s", "ns", "predicted", "p50", "p99"), rows)
+        + "\n\n![Cost of an event against K, stride, resolution, rate and cameras](growth.svg)"
+    )
+
+
 def _missing(part: dict[str, Any]) -> str:
     return f"\n\nNot measured: `pip install {' '.join(part['missing'])}`." if part.get("missing") else ""
 
@@ -228,6 +284,9 @@ TABLES = {
     "replay": _replay,
     "learning": _learning,
     "memory": _memory,
+    "overload": _overload,
+    "cluster": _cluster,
+    "growth": _growth,
 }
 
 

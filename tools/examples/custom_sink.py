@@ -6,6 +6,7 @@ Lives here: a sink of your own behind the pipeline that `streamfeat replay` uses
 Not here: the sinks that come with streamfeat (`streamfeat.stream.sinks`).
 """
 
+import asyncio
 import csv
 import sys
 import time
@@ -13,9 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import streamfeat as sf
-from streamfeat.stream.emission import Emission, EmitPolicy
-from streamfeat.stream.pipeline import Pipeline, run_until_interrupted
-from streamfeat.stream.session import Session
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
@@ -30,7 +28,7 @@ class ChangesOfMind:
         self.last = (None, None)
         self.changes = 0
 
-    def write(self, emissions: Sequence[Emission]) -> None:
+    def write(self, emissions: Sequence[sf.Emission]) -> None:
         """Called with some emissions, in order, from one thread at a time; may take its time."""
         for emission in emissions:
             sample = emission.sample.label if emission.sample else ""
@@ -47,10 +45,10 @@ class ChangesOfMind:
 def main(target: str) -> None:
     encoder = sf.Encoder.load(RECORDINGS / "digits.safetensors")
     classifier = sf.Classifier.load(RECORDINGS / "digits_classifier.safetensors")
-    session = Session(encoder, EmitPolicy.parse("20ms"), classifier, clock=time.perf_counter)
+    session = sf.Session(encoder, sf.EmitPolicy.parse("20ms"), classifier, clock=time.perf_counter)
     sink = ChangesOfMind(target)
     with sf.open_recording(RECORDINGS / "digits_test.mcap") as recording:
-        run_until_interrupted([Pipeline(recording.items(), session, [sink])])
+        asyncio.run(sf.Pipeline(recording.items(), session, [sink]).run())
     print(f"{target}: {sink.changes} changes in {session.stats().samples} samples")
 
 

@@ -27,7 +27,9 @@ def main(n_samples: int = 120) -> float:
     with sf.open_recording(RECORDING) as recording:
         samples = list(recording.samples())[:n_samples]
         for patch in (4, 8):
-            setting = Setting(patch=patch, stride=4, max_count=2, filters=16, volumes=1_000, iterations=3)
+            size = {"patch": patch, "stride": 4, "max_count": 2, "filters": 16}
+            # So few filters have few large codes: lower thresholds than the defaults, which are for 400.
+            setting = Setting(**size, lambda0=0.5, threshold=0.5, volumes=1_000, iterations=3)
             encoders.append(learn_encoder([recording], setting))
 
     # Features of each encoder and fold are kept, so that values of C cost next to nothing.

@@ -1,72 +1,42 @@
 """Classify live cameras inside an asyncio program of your own.
 
     streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop &
-    python tools/examples/live_asyncio.py robot/cam0/events
+    python tools/examples/live_asyncio.py 'robot/*/events'
 
-Lives here: zenoh's thread on one side, an engine on the other, and what lies between: one bounded queue.
-Not here: losses, restarts, many cameras, metrics; `streamfeat listen` has all of that.
+Lives here: a program that takes predictions as they come, and says every second what was lost.
+Not here: listening itself (`streamfeat.listen`), which is that of `streamfeat listen`.
 """
 
 import asyncio
-import contextlib
 import sys
-import time
 from pathlib import Path
 
-import zenoh
-
 import streamfeat as sf
-from streamfeat.live.network import open_session
-from streamfeat.messages.packets import Packet, PacketReader
-from streamfeat.stream.emission import EmitPolicy
-from streamfeat.stream.session import Session
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
-SCHEMA = "event_camera_msgs/msg/EventPacket"
+MODEL, CLASSIFIER = RECORDINGS / "digits.safetensors", RECORDINGS / "digits_classifier.safetensors"
 
 
-async def packets(key: str, port: int):
-    """Packets of one key as they come. The oldest of 64 is dropped when we are slow; zenoh never waits."""
-    loop, reader = asyncio.get_running_loop(), PacketReader(key)
-    queue: asyncio.Queue[bytes] = asyncio.Queue(64)
-
-    def put(payload: bytes) -> None:
-        if queue.full():
-            queue.get_nowait()
-        queue.put_nowait(payload)
-
-    def on_sample(sample: zenoh.Sample) -> None:  # in a thread of zenoh's
-        loop.call_soon_threadsafe(put, sample.payload.to_bytes())
-
-    with open_session(None, port=port) as session:
-        subscriber = session.declare_subscriber(key, on_sample)
-        try:
-            number = 0
-            while True:
-                payload, number = await queue.get(), number + 1
-                with contextlib.suppress(sf.InputError):  # somebody else's bytes
-                    yield reader.read(SCHEMA, payload, time.time_ns(), number)
-        finally:
-            subscriber.undeclare()
+async def report(emissions) -> None:
+    """Any other work of the program: the loop is free while threads decode and compute."""
+    while True:
+        await asyncio.sleep(1)
+        stats = emissions.stats()
+        print(f"{stats.session.events:,} events; not used: {sum(stats.drops.values())}", file=sys.stderr)
 
 
-async def main(key: str, n_readings: int | None = None, port: int = 7447) -> list[str]:
-    encoder = sf.Encoder.load(RECORDINGS / "digits.safetensors")
-    classifier = sf.Classifier.load(RECORDINGS / "digits_classifier.safetensors")
-    session = Session(encoder, EmitPolicy.parse("50ms"), classifier, clock=time.perf_counter)
-
-    def process(packet: Packet) -> list[str]:
-        return [str(emission.prediction) for emission in session.process(packet)]
-
+async def main(topics: str, n_emissions: int | None = None, port: int = 7447) -> list[str]:
     seen: list[str] = []
-    async with contextlib.aclosing(packets(key, port)) as incoming:
-        async for packet in incoming:
-            # Kernels release the GIL: the loop goes on while a thread computes.
-            for prediction in await asyncio.to_thread(process, packet):
-                print(f"{session.stats().events:>9,} events  {prediction}")
-                seen.append(prediction)
-            if n_readings is not None and len(seen) >= n_readings:
-                break
+    async with sf.listen(topics, MODEL, CLASSIFIER, emit="50ms", port=port) as emissions:
+        reporting = asyncio.create_task(report(emissions))
+        try:
+            async for emission in emissions:
+                print(f"{emission.topic}  {emission.n_events:>9,} events  {emission.prediction}")
+                seen.append(emission.prediction)
+                if n_emissions is not None and len(seen) >= n_emissions:
+                    break
+        finally:
+            reporting.cancel()
     return seen
 
 

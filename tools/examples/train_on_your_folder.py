@@ -26,7 +26,7 @@ def main(folder: str, out: str, setting: Setting = SETTING) -> float:
     target.mkdir(parents=True, exist_ok=True)
 
     # Every fifth sample is kept for scoring. What cannot be read is told, and left out.
-    done = convert(folder, target / "recording.mcap", split_every=5, overwrite=True)
+    done = convert(folder, target / "recording.mcap", hold_out=(1, 5), overwrite=True)
     for path, reason in done.failed:
         print(f"left out: {path}: {reason}")
 

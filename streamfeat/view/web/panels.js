@@ -22,13 +22,16 @@ const DROPS = {
 };
 
 const at = (id) => document.getElementById(id);
-const model = { about: null, last: {}, scores: [], latency: [], scale: 0, frame: null, missed: 0, frames: 0 };
+const model = {
+  about: null, cameras: new Map(), camera: null, firstS: null, absolute: false,
+  scores: [], latency: [], scale: 0, frame: null, missed: 0, frames: 0,
+};
 let heardMs = 0;
 let open = false;
 let dirty = true;
 
 function forget() {
-  Object.assign(model, { last: {}, scores: [], latency: [], scale: 0, frame: null });
+  Object.assign(model, { scores: [], latency: [], scale: 0, frame: null, firstS: null });
   dirty = true;
 }
 
@@ -44,52 +47,61 @@ function keep(series, point) {
 const listener = {
   onOpen() {
     open = true;
+    model.cameras.clear();
     forget();
   },
   onClose() {
     open = false;
     dirty = true;
   },
-  onChannels(channels) {
-    const cameras = channels.filter(({ schemaName }) => schemaName === "streamfeat.Status");
-    const chooser = at("camera");
-    const before = chooser.value;
-    const names = cameras.map(({ topic }) => topic.slice(0, topic.lastIndexOf("/"))).sort();
-    chooser.replaceChildren(...names.map((name) => new Option(name.replace(/\/view$/, "") || "recording", name)));
-    if (names.includes(before)) chooser.value = before;
-    at("chooser").hidden = names.length < 2;
-    choose(channels);
-  },
-  onMessage(channel, message) {
-    const name = channel.topic.slice(channel.topic.lastIndexOf("/") + 1);
-    heardMs = performance.now();
-    model.last[name] = message;
-    if (name === "status") {
+  onMessage(camera, channel, message) {
+    dirty = true;
+    if (channel === "about") {
+      const { labels, ...about } = message;
+      model.about = { ...about, labels: labels ? labels.split("\n") : [] };
+      document.body.classList.toggle("plain", !about.formulation);
+      document.body.classList.toggle("unjudged", !labels);
+      return;
+    }
+    if (!model.cameras.has(camera)) {
+      model.cameras.set(camera, { last: {} });
+      offerCameras();
+    }
+    const { last } = model.cameras.get(camera);
+    last[channel] = message;
+    if (channel === "player") {
+      at("player").hidden = false;
+      return;
+    }
+    if (camera !== model.camera) return;
+    if (channel === "events" || channel === "status") heardMs = performance.now();
+    if (channel === "status") {
       if (model.frame !== null && message.frame > model.frame + 1) model.missed += message.frame - model.frame - 1;
       if (message.frame !== model.frame) model.frames++;
       model.frame = message.frame;
-      const { median, max, n } = message.update_us;
-      if (n) keep(model.latency, { t: message.t_s, values: [median, max], part: 0 });
+      if (model.firstS === null || message.t_s < model.firstS) model.firstS = message.t_s;
     }
-    if (name === "prediction") {
+    if (channel === "engine" && message.update_us.n) {
+      const { median, max } = message.update_us;
+      keep(model.latency, { t: message.t_s, values: [median, max], part: 0 });
+    }
+    if (channel === "prediction") {
       const { t_s: t, scores, sample, label } = message;
       keep(model.scores, { t, values: scores, part: sample ? sample.start_s : null, label, truth: sample?.label });
     }
-    dirty = true;
   },
 };
 
-/** Follow the chosen camera. */
-function choose(channels) {
-  const prefix = at("camera").value;
-  const chosen = channels.filter(({ topic }) => topic.slice(0, topic.lastIndexOf("/")) === prefix);
-  const status = chosen.find(({ schemaName }) => schemaName === "streamfeat.Status");
-  if (status) {
-    const { labels, ...about } = status.metadata;
-    model.about = { ...about, labels: labels ? labels.split("\n") : [] };
+/** The cameras there are, to choose from; the first is chosen. */
+function offerCameras() {
+  const names = [...model.cameras.keys()].sort();
+  at("camera").replaceChildren(...names.map((name) => new Option(name.replace(/\/view$/, "") || "recording", name)));
+  if (!names.includes(model.camera)) {
+    model.camera = names[0];
+    forget();
   }
-  stream.subscribe(chosen);
-  dirty = true;
+  at("camera").value = model.camera;
+  at("chooser").hidden = names.length < 2;
 }
 
 /** Draw in a canvas, or say what is missing. */
@@ -100,23 +112,28 @@ function panel(id, ready, draw, otherwise = "nothing to show yet") {
 
 function drawAll() {
   dirty = false;
-  const { about, last } = model;
-  const { status, events, bins, volumes, features } = last;
+  const { about } = model;
+  const { last } = model.cameras.get(model.camera) ?? { last: {} };
+  const { status, engine, events, bins, volumes, features } = last;
   document.body.dataset.frames = model.frames;
   document.body.dataset.missed = model.missed;
-  at("time").textContent = status ? `stream time ${status.t_s.toFixed(2)} s` : "";
-  const binMs = about ? Number(about.bin_us) / 1000 : 0;
+  const startS = model.absolute ? 0 : model.firstS ?? 0;
+  at("time").textContent = status
+    ? `${model.absolute ? "camera" : "stream"} time ${(status.t_s - startS).toFixed(2)} s`
+    : "";
+  drawPlayer(last);
+  if (events) at("events-note").textContent = "the latest event of each pixel";
+  const binMs = about?.bin_us ? Number(about.bin_us) / 1000 : 0;
   const ms = (value) => `${number(Math.round(value * 10) / 10)} ms`;
-  if (about) {
+  if (about?.formulation) {
     at("model").textContent =
       `${about.formulation}, ${about.encoding}, K = ${about.filters}, patch ${about.patch}, ` +
       `stride ${about.stride}, ${about.bins} bins of ${ms(binMs)}`;
-    at("events-note").textContent = `latest of each pixel, last ${ms(binMs)}`;
     at("bins-note").textContent = `signed counts, clipped at ±${about.max_count}, in each time bin`;
   }
-  at("volumes-note").textContent = status ? `${status.active_volumes} of ${status.volumes}` : "";
+  at("volumes-note").textContent = engine ? `${engine.active_volumes} of ${engine.volumes}` : "";
   panel("events", events, (canvas) => drawPicture(canvas, events, signedColours()));
-  panel("bins", bins && about, (canvas) => {
+  panel("bins", bins && about?.bins, (canvas) => {
     const n = Number(about.bins);
     const captions = Array.from({ length: n }, (_, i) => (i === n - 1 ? "now" : `−${ms((n - 1 - i) * binMs)}`));
     // A tile has w columns and a gap max(1, floor(w / 32)).
@@ -125,8 +142,8 @@ function drawAll() {
     drawPicture(canvas, bins, signedColours(), captions, Math.max(1, Math.floor(wide / 32)));
   });
   panel("volumes", volumes, (canvas) => drawPicture(canvas, volumes, plainColours()));
-  panel("features", features && about, drawFeatures);
-  drawScores();
+  panel("features", features && about?.filters, (canvas) => drawFeatures(canvas, features));
+  drawScores(last.prediction);
   panel("latency", model.latency.length, (canvas) =>
     drawLines(canvas, {
       points: model.latency,
@@ -137,11 +154,10 @@ function drawAll() {
       label: duration,
     }),
   );
-  if (status) drawCounts(status);
+  if (status) drawCounts(status, engine);
 }
 
-function drawFeatures(canvas) {
-  const { features } = model.last;
+function drawFeatures(canvas, features) {
   const { cells } = features;
   const side = Math.sqrt(cells.length);
   const place = (i) => (side === 1 ? "whole grid" : `row ${Math.floor(i / side) + 1}, column ${(i % side) + 1}`);
@@ -167,9 +183,8 @@ function leaders(labels) {
   return most.map(([i]) => i).sort((a, b) => a - b);
 }
 
-function drawScores() {
+function drawScores(prediction) {
   const { about } = model;
-  const prediction = model.last.prediction;
   if (about && !about.labels.length) {
     at("legend").replaceChildren();
     at("verdict").textContent = "";
@@ -227,16 +242,22 @@ function drawVerdict({ label, sample, samples, right, incomplete }) {
   if (incomplete) verdict.append(" · packets are missing");
 }
 
-function drawCounts(status) {
+function drawCounts(status, engine) {
   const rows = [
     ["events", status.events.toLocaleString("en")],
     ["event rate", `${status.events_per_s.toLocaleString("en")} /s`],
     ["sensor", `${status.width} × ${status.height} pixels`],
-    ["update, median", duration(status.update_us.median)],
-    ["update, longest", duration(status.update_us.max)],
+    ...(engine
+      ? [
+          ["update, median", duration(engine.update_us.median)],
+          ["update, longest", duration(engine.update_us.max)],
+        ]
+      : []),
   ].map(([name, value]) => [name, value, false]);
   const drops = { ...status.drops, missed: model.missed };
-  Object.entries(drops).forEach(([name, n]) => rows.push([DROPS[name] ?? name, n.toLocaleString("en"), n > 0]));
+  Object.entries(drops)
+    .filter(([, n]) => n > 0)
+    .forEach(([name, n]) => rows.push([DROPS[name] ?? name, n.toLocaleString("en"), true]));
   at("counts").replaceChildren(
     ...rows.map(([name, value, some]) => {
       const row = document.createElement("div");
@@ -265,11 +286,68 @@ function turn() {
   requestAnimationFrame(turn);
 }
 
-const stream = new Stream(document.body.dataset.port, listener);
+/** Where the player is, and the event rate over the recording behind it. */
+function drawPlayer({ player, timeline }) {
+  if (!player) return;
+  at("play").textContent = player.ended ? "again" : player.paused ? "play" : "pause";
+  const lengthS = timeline ? timeline.column_s * timeline.counts.length : 0;
+  at("at").textContent = `${player.at_s.toFixed(2)}${timeline?.done ? ` of ${lengthS.toFixed(2)}` : ""} s`;
+  if (document.activeElement !== at("speed")) at("speed").value = player.speed ?? "";
+  if (!timeline) return;
+  const { context, width, height } = cleared(at("timeline"));
+  const most = Math.max(1, ...timeline.counts);
+  const column = width / timeline.counts.length;
+  context.fillStyle = colour("line");
+  timeline.counts.forEach((count, i) => {
+    const tall = (count / most) * (height - 4);
+    context.fillRect(i * column, height - tall, Math.max(column, 0.6), tall);
+  });
+  context.fillStyle = colour("accent");
+  context.fillRect((player.at_s / lengthS) * width - 1, 0, 2, height);
+}
+
+const stream = new Stream(document.body.dataset.port, document.body.dataset.token, listener);
+const lastOf = (channel) => model.cameras.get(model.camera)?.last[channel];
 at("camera").onchange = () => {
+  model.camera = at("camera").value;
   forget();
-  choose([...stream.channels.values()]);
 };
+at("time").onclick = () => {
+  model.absolute = !model.absolute;
+  dirty = true;
+};
+const toggle = () => {
+  const player = lastOf("player");
+  if (player?.ended) stream.ask("seek", { value: 0 });
+  else if (player) stream.ask("pause", { value: !player.paused });
+};
+at("play").onclick = toggle;
+at("step").onclick = () => stream.ask("step");
+at("speed").onchange = () => {
+  stream.ask("speed", { value: at("speed").value ? Number(at("speed").value) : null });
+  at("speed").blur();
+};
+function seek(toS) {
+  forget();
+  stream.ask("seek", { value: Math.max(0, toS) });
+}
+at("timeline").onclick = (event) => {
+  const timeline = lastOf("timeline");
+  if (timeline) seek((event.offsetX / at("timeline").clientWidth) * timeline.column_s * timeline.counts.length);
+};
+document.addEventListener("keydown", (event) => {
+  const player = lastOf("player");
+  if (!player || event.target.matches("select, input")) return;
+  const does = {
+    " ": toggle,
+    ".": () => stream.ask("step"),
+    ArrowLeft: () => seek(player.at_s - 1),
+    ArrowRight: () => seek(player.at_s + 1),
+  }[event.key];
+  if (!does || (event.key === " " && event.target.matches("button"))) return;
+  event.preventDefault();
+  does();
+});
 const redraw = () => {
   dirty = true;
 };

@@ -1,0 +1,190 @@
+"""Text: lines of events, with or without a header, whatever stands between the numbers.
+
+Lives here: byte order marks, comments, headers of faery, pandas, Metavision and others, separators, boolean
+words, and lines to columns, a bounded block at a time.
+Not here: what columns mean (`columns`), and which file is text (`event_files`).
+"""
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from streamfeat.camera_files.columns import SAMPLE_ROWS, Layout, Rows, layout_of, named_fields
+from streamfeat.camera_files.source import (
+    BLOCK_BYTES,
+    Contents,
+    Losses,
+    TableOptions,
+    checked_resolution,
+    one_line,
+)
+from streamfeat.errors import InputError
+from streamfeat.events import Events, Resolution
+
+__all__ = ["open_text"]
+
+_HEADER_LINES = 1_000  # before the first event
+_TRUE, _FALSE = re.compile(r"(?i)\b(?:true|on)\b"), re.compile(r"(?i)\b(?:false|off)\b")
+_WORD = re.compile(r"(?i)true|false|on|off")
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.IGNORECASE)
+_SIZES = (
+    re.compile(r"(?i)geometry\D{0,4}(\d+)\s*[,;x ]\s*(\d+)"),
+    re.compile(r"(?i)\bwidth\W{1,3}(\d+)\W+height\W{1,3}(\d+)"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """How the lines of a file are written.
+
+    Attributes:
+        skip: lines before the first event that are no comments.
+        separator: between columns, None for any white space.
+        has_words: polarities are words.
+        has_decimal_commas: numbers have a comma where others have a point.
+    """
+
+    skip: int
+    separator: str | None
+    has_words: bool
+    has_decimal_commas: bool
+
+
+def open_text(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """Look at the first lines: comments, `width height`, or column names, then events.
+
+    Raises:
+        InputError: they do not show the layout of a table of events.
+    """
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: is UTF-16 text; save it as UTF-8")
+    with path.open("rb") as raw:
+        block = raw.read(BLOCK_BYTES)
+    lines = _lines(block)
+    lines = lines if len(block) < BLOCK_BYTES else lines[:-1]
+    form, names, resolution, first = _form(path, lines)
+    sample = [line for line in lines[first : first + SAMPLE_ROWS] if not _is_comment(line)]
+    n_columns = len(names or _split(sample[0], form.separator))
+    fields = named_fields(names)[0] if names and not options.columns else {}
+    if not fields or len(fields) == 4:
+        wanted = sorted(fields.values()) or list(range(n_columns))
+        if len(sample) > 1 and len(_split(sample[-1], form.separator)) <= max(wanted):
+            sample = sample[:-1]  # cut short
+        read = dict(zip(wanted, _columns(path, 0, sample, form, wanted), strict=True))
+        table = [read.get(i, np.empty(0)) for i in range(n_columns)]
+    else:
+        table = [np.empty(0)] * n_columns
+    layout = layout_of(path, table, names, options)
+    return Contents(partial(_read, path, form, layout), resolution, assumptions=layout.assumptions)
+
+
+def _lines(block: bytes) -> list[str]:
+    return block.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace").splitlines()
+
+
+def _form(path: Path, lines: list[str]) -> tuple[_Form, list[str] | None, Resolution | None, int]:
+    """The form of the lines, the names of columns, the resolution, and the line of the first event."""
+    resolution: Resolution | None = None
+    names: list[str] | None = None
+    skip = 0
+    for at, line in enumerate(lines[:_HEADER_LINES]):
+        if match := next((m for size in _SIZES if (m := size.search(line))), None):
+            resolution = checked_resolution(path, match[2], match[1])
+        if _is_comment(line):
+            said = _names(line.lstrip(" #%/"))
+            names = said if len(named_fields(said)[0]) == 4 else names
+            continue
+        separator = _separator(line)
+        fields = _split(line, separator)
+        if len(fields) == 2 and all(field.isdecimal() for field in fields) and resolution is None:
+            resolution = checked_resolution(path, fields[1], fields[0])
+        elif all(_NUMBER.fullmatch(field) or _WORD.fullmatch(field) for field in fields if field):
+            has_words = any(_WORD.fullmatch(field) for field in fields)
+            commas = separator != "," and "," in line
+            return _Form(skip, separator, has_words, commas), names, resolution, at
+        elif skip < 3:
+            names = _names(line)
+            sizes = dict(re.findall(r"(?i)\b([xy])@(\d+)", line))
+            if len(sizes) == 2:
+                resolution = checked_resolution(path, sizes["y"], sizes["x"])
+            if len(named_fields(names)[0]) < 4:
+                raise InputError(f"{path}: columns {line:.80} lack one of t, x, y, p")
+        else:
+            break
+        skip += 1
+    raise InputError(f"{path}: holds no line of events 't x y p' in its first {BLOCK_BYTES} bytes")
+
+
+def _names(line: str) -> list[str]:
+    separator = next((c for c in ";\t," if c in line), None)
+    return [name.strip().strip("\"'") for name in line.split(separator)]
+
+
+def _separator(line: str) -> str | None:
+    return next((c for c in ";," if c in line), None)
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    return [field.strip() for field in line.split(separator)]
+
+
+def _is_comment(line: str) -> bool:
+    return not line.strip() or line.lstrip()[0] in "#%" or line.lstrip().startswith("//")
+
+
+def _columns(
+    path: Path, first_row: int, lines: list[str], form: _Form, wanted: list[int]
+) -> list[NDArray[Any]]:
+    """The wanted columns of lines; whole numbers stay whole where float64 would not hold them."""
+    if form.has_words:
+        lines = [_FALSE.sub("0", _TRUE.sub("1", line)) for line in lines]
+    if form.has_decimal_commas:
+        lines = [line.replace(",", ".") for line in lines]
+    fields = _split(lines[0], form.separator)
+    kinds = ["i8" if i < len(fields) and re.fullmatch(r"[+-]?\d{10,18}", fields[i]) else "f8" for i in wanted]
+    dtype = np.dtype([(f"c{i}", kind) for i, kind in zip(wanted, kinds, strict=True)])
+    try:
+        with warnings.catch_warnings(action="error"):
+            rows = np.loadtxt(lines, dtype, comments=None, delimiter=form.separator, usecols=wanted, ndmin=1)
+    except (ValueError, IndexError, UserWarning, OverflowError, DeprecationWarning) as error:
+        raise InputError(
+            f"{path}: after event {first_row}: {one_line(error)}; expected lines of numbers 't x y p' columns"
+        ) from error
+    return [rows[name] for name in dtype.names or ()]
+
+
+def _read(path: Path, form: _Form, layout: Layout, losses: Losses) -> Iterator[Events]:
+    """Lines of events, in blocks; half a line at the end is counted as lost."""
+    rows = Rows(path, layout.unit)
+    wanted = sorted(layout.order)
+
+    def events(lines: list[str]) -> Events:
+        found = dict(zip(wanted, _columns(path, rows.n, lines, form, wanted), strict=True))
+        return rows.events({field: found[i] for field, i in zip("txyp", layout.order, strict=True)})
+
+    with path.open("rb") as raw:
+        skip, rest = form.skip, b""
+        while block := raw.read(BLOCK_BYTES):
+            whole, newline, rest = (rest + block).rpartition(b"\n")
+            if not newline and len(rest) > BLOCK_BYTES:
+                raise InputError(
+                    f"{path}: byte {raw.tell() - len(rest)}: no end of line; this is not event text"
+                )
+            lines = [line for line in _lines(whole) if not _is_comment(line)]
+            lines, skip = lines[skip:], max(0, skip - len(lines))
+            if lines:
+                yield events(lines)
+        last = rest.decode("utf-8", "replace")
+        if _is_comment(last):
+            return
+        if len(_split(last, form.separator)) <= max(layout.order):
+            losses.lose(len(rest), f"{len(rest)} bytes at byte {raw.tell() - len(rest)} are not a whole line")
+        else:
+            yield events([last])

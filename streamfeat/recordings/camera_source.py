@@ -1,0 +1,105 @@
+"""A camera file as the source of a recording.
+
+Lives here: its events as packets, what had to be assumed, and what could not be read, as a loss.
+Not here: the formats (`streamfeat.camera_files`).
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import numpy as np
+
+from streamfeat.camera_files.event_files import EventFile, open_events
+from streamfeat.camera_files.source import TableOptions
+from streamfeat.errors import InputError
+from streamfeat.events import Events
+from streamfeat.files.locations import Location, fetched
+from streamfeat.messages.packets import MAX_PIXELS, Packet
+from streamfeat.recordings.options import ReadOptions
+from streamfeat.recordings.records import Losses
+from streamfeat.recordings.sources import Part, Topic
+
+__all__ = ["CameraSource"]
+
+_TOPIC = "/events"
+_PACKET_EVENTS = 8192
+_PACKET_US = 1_000_000
+
+
+class CameraSource:
+    """See `Source`; it is read as a whole, in packets of a length that cameras send.
+
+    Its log time is that of its events.
+
+    Args:
+        path: the file; one in a store is copied for as long as this is open.
+        topic: name of one event stream, where there are several.
+        options: what the file does not say.
+
+    Raises:
+        InputError: it is of no known format, or cannot be read; or has several streams and none is chosen.
+    """
+
+    topics: list[Topic]
+
+    def __init__(self, path: Location, topic: str | None, options: ReadOptions) -> None:
+        """Open it, and find out what is there."""
+        self.path = path
+        stream = None if topic == _TOPIC else topic
+        tables = TableOptions(options.columns, options.time_unit, options.resolution, stream)
+        with ExitStack() as copies:
+            local = copies.enter_context(fetched(path))
+            self._local, self._copies = local, ExitStack()
+            try:
+                self._file: EventFile = open_events(local, options=tables)
+                self.resolution = self._file.resolution
+                self.assumptions = [self._named(f"{local}: {line}") for line in self._file.assumptions]
+            except InputError as error:
+                raise InputError(self._named(str(error))) from None
+            self._copies = copies.pop_all()
+        height, width = self.resolution
+        if height * width > MAX_PIXELS:
+            self.close()
+            raise InputError(f"{path}: a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
+        streams = self._file.streams
+        self._topic = stream or (streams[0] if len(streams) == 1 else _TOPIC)
+        self.topics = [Topic(self._topic, self._file.format, "", 0, is_events=True)]
+
+    def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, Packet]]:
+        """See `Source`; the byte of every packet is 0."""
+        seq = 0
+        try:
+            for block in self._file.blocks():
+                for events in _cut(block):
+                    log_time_ns = int(events["t"][0]) * 1000
+                    yield 0, Packet(self._topic, events, self.resolution, log_time_ns, seq)
+                    seq += 1
+        except InputError as error:
+            if seq == 0:
+                raise InputError(self._named(str(error))) from None
+            losses.add("damaged file", 0, self._named(str(error)))
+        for line in self._file.damage:
+            losses.add("damaged file", self._file.lost_bytes, self._named(f"{self._local}: {line}"))
+
+    def cuts(self) -> list[int]:
+        """See `Source`."""
+        return []
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._copies.close()
+
+    def _named(self, text: str) -> str:
+        """A message with the name of the file that its user knows."""
+        return text.replace(str(self._local), str(self.path))
+
+
+def _cut(block: Events) -> Iterator[Events]:
+    """A block in packets of at most 8192 events, whose times lie within a second of the first."""
+    start = 0
+    while start < len(block):
+        packet = block[start : start + _PACKET_EVENTS]
+        far = np.flatnonzero(np.abs(packet["t"] - packet["t"][0]) >= _PACKET_US)
+        packet = packet[: far[0]] if len(far) else packet
+        yield packet
+        start += len(packet)

@@ -1,0 +1,222 @@
+"""Labels for a recording that has none: from a table, put between its packets.
+
+Lives here: reading a label file, and where its labels stand in a stream.
+Not here: labels that are in the recording (`reader`), and samples made of them (`samples`).
+
+A label file is a table with commas and a line of names: `start`, `end` (or `duration`) and `label`, and if
+wanted `split` and `source`. What the names of the times end in is their unit: `start_s` counts seconds after
+the first event, `start_ms` milliseconds after it, `start_us` is stream time in microseconds, as emissions
+and `info` print it. Without such an ending the values decide: whole numbers of which one reaches 100,000 are
+stream time, all others are seconds after the first event; which of the two is said.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from streamfeat.errors import InputError
+from streamfeat.messages.packets import Label, Packet
+
+__all__ = ["LabelTable", "read_labels", "with_labels"]
+
+_MOST_BYTES = 64 << 20
+_LATEST_US = 1 << 52
+_LEAST_STREAM_US = 100_000
+_NAMES = {
+    "start": ("start", "begin", "onset", "from", "t_start", "start_time"),
+    "end": ("end", "stop", "offset", "to", "t_end", "end_time"),
+    "duration": ("duration", "length"),
+    "label": ("label", "class", "name", "category", "annotation"),
+    "split": ("split", "set", "subset"),
+    "source": ("source", "file"),
+}
+_UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTable:
+    """Labels of one file, in order of time.
+
+    Attributes:
+        path: of the file.
+        labels: with times as they are there, in microseconds.
+        is_relative: whether times count from the first event.
+        assumption: what the file does not say; empty if it says all.
+    """
+
+    path: Path
+    labels: tuple[Label, ...]
+    is_relative: bool
+    assumption: str = ""
+
+
+def read_labels(path: Path) -> LabelTable:
+    """Read a label file.
+
+    Raises:
+        InputError: it is missing, or no such table; a time is none, or two labels overlap. Names the line.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: a label file of over {_MOST_BYTES >> 20} MiB; is this the right file?")
+        text = path.read_text("utf-8-sig", "replace")
+    except OSError as error:
+        raise InputError(f"{path}: labels cannot be read: {error.strerror}") from None
+    rows = [(n, row) for n, row in enumerate(_rows(path, text), 1) if any(row) and not row[0].startswith("#")]
+    if len(rows) < 2:
+        raise InputError(f"{path}: holds no labels; expected a line 'start,end,label' and one for each label")
+    columns, unit = _columns(path, rows[0][1])
+    times: list[tuple[float, float]] = []
+    for n, row in rows[1:]:
+        start, end = (_number(path, n, row, columns, name) for name in ("start", "end"))
+        if "duration" in columns:
+            end = start + _number(path, n, row, columns, "duration")
+        if not start < end:
+            raise InputError(f"{path}: line {n}: ends at {end:g}, which is not after its start at {start:g}")
+        times.append((start, end))
+    assumption = ""
+    if not unit:
+        largest = max(end for _, end in times)
+        is_whole = all(value.is_integer() for pair in times for value in pair)
+        unit = "us" if is_whole and largest >= _LEAST_STREAM_US else "s"
+        meant = "stream time in microseconds" if unit == "us" else "seconds after the first event"
+        assumption = f"{path}: times are taken for {meant}; name the columns start_s or start_us to say so"
+    labels = []
+    for (n, row), (start, end) in zip(rows[1:], times, strict=True):
+        start_us, end_us = round(start * _UNITS_US[unit]), round(end * _UNITS_US[unit])
+        if not (abs(start_us) < _LATEST_US and start_us < end_us < _LATEST_US):
+            raise InputError(f"{path}: line {n}: from {start:g} to {end:g} {unit} is no time of a recording")
+        name, split, source = (
+            row[columns[c]].strip() if columns.get(c, len(row)) < len(row) else ""
+            for c in ("label", "split", "source")
+        )
+        if not name:
+            raise InputError(f"{path}: line {n}: the label is empty")
+        labels.append((Label(start_us, end_us - start_us, name, split, source or f"{path.name}:{n}"), n))
+    labels.sort(key=lambda found: found[0].start_us)
+    for (first, n), (second, m) in pairwise(labels):
+        if second.start_us < first.start_us + first.duration_us:
+            raise InputError(
+                f"{path}: lines {n} and {m} overlap: {first.label!r} ends after {second.label!r} begins; "
+                "a moment has one label"
+            )
+    return LabelTable(path, tuple(label for label, _ in labels), unit != "us", assumption)
+
+
+def _rows(path: Path, text: str) -> Iterator[list[str]]:
+    try:
+        dialect = csv.Sniffer().sniff(text[:4096], delimiters=",;\t")
+    except csv.Error:
+        dialect = csv.excel
+    try:
+        yield from csv.reader(io.StringIO(text), dialect)
+    except csv.Error as error:
+        raise InputError(f"{path}: is no table of labels: {error}") from None
+
+
+def _columns(path: Path, names: Sequence[str]) -> tuple[dict[str, int], str]:
+    """Where each column is, and the unit of the times, "" if no name says it.
+
+    Raises:
+        InputError: a column is missing or unknown, or times have two units.
+    """
+    found: dict[str, int] = {}
+    units: set[str] = set()
+    unknown = []
+    for at, name in enumerate(n.strip().lower() for n in names):
+        plain, _, unit = name.rpartition("_")
+        plain, unit = (plain, unit) if unit in _UNITS_US else (name, "")
+        column = next((column for column, others in _NAMES.items() if plain in others), None)
+        if column is None or column in found:
+            unknown.append(names[at].strip())
+            continue
+        found[column] = at
+        if column in ("start", "end", "duration"):
+            units.add(unit)
+    shown = ",".join(n.strip() for n in names)
+    if (
+        "start" not in found
+        or "label" not in found
+        or not ("end" in found) ^ ("duration" in found)
+        or unknown
+    ):
+        wrong = f"unknown: {', '.join(unknown)}" if unknown else "columns are missing or twice there"
+        raise InputError(
+            f"{path}: columns {shown:.80} are not those of labels ({wrong:.80}); expected start, end (or "
+            "duration), label, and perhaps split and source"
+        )
+    if len(units) > 1:
+        raise InputError(f"{path}: columns {shown:.80} have times of two units; give both the same")
+    return found, units.pop()
+
+
+def _number(path: Path, n: int, row: Sequence[str], columns: dict[str, int], name: str) -> float:
+    if name not in columns:
+        return 0.0
+    text = row[columns[name]].strip() if columns[name] < len(row) else ""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        raise InputError(f"{path}: line {n}: {name} {text!r:.40} is no number")
+    return value
+
+
+def with_labels(
+    placed: Iterable[tuple[int, Packet | Label]], table: LabelTable
+) -> Iterator[tuple[int, Packet | Label]]:
+    """Put labels into a stream, in place of its own: each before the first event at or after its start.
+
+    A packet in which a label begins is cut there. Events that come later but are earlier stay behind it.
+
+    Args:
+        placed: items of a recording, each with its byte.
+        table: the labels.
+
+    Raises:
+        InputError: at the end, if no label has begun: the file is of another recording.
+    """
+    waiting = list(reversed(table.labels))
+    first_us: int | None = None
+    last_us, begun = 0, 0
+    shift_us = 0
+    for at, item in placed:
+        if isinstance(item, Label):
+            continue
+        if not len(item.events):
+            yield at, item
+            continue
+        latest = np.maximum.accumulate(item.events["t"])
+        if first_us is None:
+            first_us = int(latest[0])
+            shift_us = first_us if table.is_relative else 0
+            while waiting and waiting[-1].start_us + waiting[-1].duration_us + shift_us <= first_us:
+                waiting.pop()  # it ended before anything happened
+        last_us = max(last_us, int(latest[-1]))
+        done = 0
+        while waiting and waiting[-1].start_us + shift_us <= int(latest[-1]):
+            label = waiting.pop()
+            label = replace(label, start_us=label.start_us + shift_us)
+            cut = max(int(np.searchsorted(latest, label.start_us)), done)
+            if cut > done:
+                yield at, replace(item, events=item.events[done:cut], lost=item.lost if done == 0 else 0)
+            done = cut
+            begun += 1
+            yield at, label
+        if done < len(latest):
+            rest = item if done == 0 else replace(item, events=item.events[done:], lost=0)
+            yield at, rest
+    if not begun:
+        label = table.labels[0]
+        where = f"{(first_us or 0)} to {last_us} us"
+        raise InputError(
+            f"{table.path}: no label lies within the recording, which goes from {where}; the first is from "
+            f"{label.start_us + shift_us} us on. Is it the file of another recording?"
+        )

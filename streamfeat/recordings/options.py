@@ -1,0 +1,35 @@
+"""How a recording is to be read, where it does not say so itself or more is wanted than what is in it.
+
+Lives here: `ReadOptions`, which every command that reads a recording takes.
+Not here: what becomes of them (`opening`, `labels`, `streamfeat.denoise`).
+"""
+
+from dataclasses import dataclass, field
+
+from streamfeat.denoise.stage import Denoising
+from streamfeat.events import Resolution
+
+__all__ = ["AS_IT_IS", "ReadOptions"]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """What a recording does not say, or what is wanted beyond it. It is small and can be pickled.
+
+    Attributes:
+        columns: order of the columns of a table, such as `t,x,y,p`.
+        time_unit: of the times of a table: `s`, `ms`, `us` or `ns`.
+        resolution: `(height, width)` of a camera file, instead of what it says.
+        labels: a label file, or a topic of texts, see `streamfeat.recordings.labels`.
+        denoising: noise that is taken out before anything else looks at the events.
+    """
+
+    columns: str | None = None
+    time_unit: str | None = None
+    resolution: Resolution | None = None
+    labels: str | None = None
+    denoising: Denoising = field(default_factory=Denoising)
+
+
+AS_IT_IS = ReadOptions()
+"""What the files say, and no more."""

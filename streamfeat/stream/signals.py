@@ -1,0 +1,78 @@
+"""SIGINT and SIGTERM for programs that run pipelines and nothing else.
+
+Lives here: running pipelines in an event loop of their own until a signal stops them.
+Not here: the pipeline itself, which knows nothing of signals and runs in any loop (`pipeline`).
+"""
+
+import asyncio
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from threading import current_thread, main_thread
+from typing import Any
+
+from streamfeat.stream.pipeline import Pipeline
+
+__all__ = ["run_until_interrupted", "signals_wait"]
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def signals_wait() -> Iterator[None]:
+    """SIGINT and SIGTERM wait until `run_until_interrupted` can hear them, or until the block ends.
+
+    For opening sinks: a signal between opening them and running would leave half an output behind.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def run_until_interrupted(
+    pipelines: Sequence[Pipeline[Any, Any]], interrupt: Callable[[], None] | None = None
+) -> bool:
+    """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
+
+    Args:
+        pipelines: not run before.
+        interrupt: what a signal does; if not given, it stops every pipeline.
+
+    Returns:
+        whether there was a signal.
+    """
+    interrupted = False
+
+    def on_signal() -> None:
+        nonlocal interrupted
+        interrupted = True
+        if interrupt:
+            interrupt()
+        else:
+            for pipeline in pipelines:
+                pipeline.stop()
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        # Only the main thread of a process can be told of signals.
+        names = _SIGNALS if current_thread() is main_thread() else ()
+        before = {name: signal.getsignal(name) for name in names}
+        for name in names:
+            loop.add_signal_handler(name, on_signal)
+        mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, names)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                for pipeline in pipelines:
+                    tasks.create_task(pipeline.run())
+        except BaseExceptionGroup as group:
+            raise group.exceptions[0] from None
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            for name, handler in before.items():
+                loop.remove_signal_handler(name)
+                signal.signal(name, handler)
+
+    asyncio.run(run())
+    return interrupted

@@ -1,0 +1,37 @@
+"""Compiling kernels before anything waits for them.
+
+Lives here: the one warm-up of all jobs. Not here: the kernels, and numba's cache (`kernels`).
+"""
+
+from streamfeat.engine.encoder import Encoder
+from streamfeat.events import make_events
+from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
+from streamfeat.messages.packets import Packet
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
+
+__all__ = ["warm_up"]
+
+
+def warm_up(encoder: Encoder, policy: EmitPolicy, *, decoders: bool = False) -> None:
+    """Compile what the first packets would otherwise have to wait for; quick where it is compiled already.
+
+    Args:
+        encoder: kernels depend on its formulation and encoding alone.
+        policy: that of the sessions to come.
+        decoders: compile those of live payloads, too.
+    """
+    event = make_events([0], [0], [1], [0])
+    if decoders:
+        for encoding in PAYLOAD_ENCODINGS:
+            payload, base_ns = encode(event, encoding)
+            make_decoder(encoding).decode(payload, base_ns)
+    side = encoder.geometry.patch * encoder.geometry.downsample
+    # In time and late are the two ways to feed, however long compiling takes.
+    for is_late in (False, True):
+        session = Session(encoder, policy, is_behind=lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
+        for _ in session.process(Packet("", event, (side, side), 0, 0)):
+            pass
+        session.rest()
+        for _ in session.finish():
+            pass

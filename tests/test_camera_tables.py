@@ -1,0 +1,204 @@
+"""Camera files as people have them: orders, names, units, layouts, streams; each says what was assumed."""
+
+import camera_files_scene as scenes
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from streamfeat.camera_files.event_files import open_events, read_events
+from streamfeat.camera_files.source import TableOptions
+from streamfeat.errors import InputError
+
+SCENE = scenes.scene()
+NAMES = {"x": ["x", "X", "x@64", "xs"], "y": ["y", "Y", "y@48", "ys"], "p": ["p", "pol", "on", "Polarity"]}
+NAMES |= {"t": ["t", "T", "ts", "timestamp", "t_us", "t [us]"]}
+
+
+def read(path, data, **options):
+    path.write_bytes(data)
+    return read_events(path, options=TableOptions(**options)).events
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tables")
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    order=st.permutations("txyp").map("".join),
+    names=st.fixed_dictionaries({field: st.sampled_from(names) for field, names in NAMES.items()}),
+    separator=st.sampled_from([",", ";", "\t"]),
+    start=st.sampled_from(["", "\ufeff", "# "]),
+    ending=st.sampled_from(["\n", "\r\n"]),
+)
+def test_names_decide_whatever_their_order(folder, order, names, separator, start, ending):
+    header = start + separator.join(names[field] for field in order) + ending
+    np.testing.assert_array_equal(read(folder / "a.csv", scenes.text(SCENE, order, separator, header)), SCENE)
+
+
+def test_one_step_back_in_a_short_table_does_not_swap_its_columns(tmp_path):
+    events = read(tmp_path / "a.txt", b"20 1 2 1\n10 1 2 1\n")
+    assert [events[name].tolist() for name in "txyp"] == [[20, 10], [1, 1], [2, 2], [1, 1]]
+
+
+@pytest.mark.parametrize("order", ["txyp", "xytp", "xypt", "tpxy", "pxyt", "ptxy"])
+@pytest.mark.parametrize("separator", [" ", ",", "\t", ";"])
+def test_order_is_found_by_values_and_said(tmp_path, order, separator):
+    path = tmp_path / "a.txt"
+    np.testing.assert_array_equal(read(path, scenes.text(SCENE, order, separator)), SCENE)
+    assert any(" ".join(order) in line for line in open_events(path).assumptions)
+    np.save(tmp_path / "a.npy", scenes.table(SCENE, order))
+    np.testing.assert_array_equal(read_events(tmp_path / "a.npy").events, SCENE)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "written"),
+    [(1, "microseconds", "{}"), (1, "microseconds", "{}.0"), (1000, "nanoseconds", "{}000")],
+)
+def test_unit_is_found_and_said(tmp_path, factor, unit, written):
+    path = tmp_path / "a.txt"
+    np.testing.assert_array_equal(read(path, scenes.text(SCENE, "txyp", time=written)), SCENE)
+    assert any(unit in line for line in open_events(path).assumptions)
+    columns = {name: SCENE[name] for name in "xyp"} | {"t": SCENE["t"].astype(float) * factor}
+    np.savez(tmp_path / "a.npz", **columns)
+    np.testing.assert_array_equal(read_events(tmp_path / "a.npz").events, SCENE)
+
+
+def test_options_set_order_unit_and_resolution(tmp_path):
+    data = scenes.text(SCENE, "ytxp", time="{}000")
+    with pytest.raises(InputError, match=r"sort its rows|p = "):
+        read(tmp_path / "a.txt", data)
+    options = {"columns": "y,t,x,p", "time_unit": "ns", "resolution": (48, 64)}
+    np.testing.assert_array_equal(read(tmp_path / "a.txt", data, **options), SCENE)
+    assert open_events(tmp_path / "a.txt", options=TableOptions(**options)).assumptions == ()
+
+
+def test_times_that_fall_are_refused_with_the_order_that_fits(tmp_path):
+    with pytest.raises(InputError, match=r"times fall in .* --columns x,y,t,p would fit"):
+        read(tmp_path / "a.txt", scenes.text(SCENE, "xytp"), columns="t,x,y,p")
+
+
+def test_words_index_columns_and_sizes(tmp_path):
+    rows = "".join(f"{e['t']},{e['x']},{e['y']},{bool(e['p'])}\n" for e in SCENE)
+    np.testing.assert_array_equal(read(tmp_path / "a.csv", b"t,x,y,on\n" + rows.encode()), SCENE)
+    indexed = "".join(f"{i},{e['t']},{e['x']},{e['y']},{e['p']}\n" for i, e in enumerate(SCENE))
+    np.testing.assert_array_equal(read(tmp_path / "a.csv", b",t,x,y,p\n" + indexed.encode()), SCENE)
+    for header in ("%geometry:64,48\n", "# width: 64, height: 48\n", "64 48\n", "t,x@64,y@48,on\n"):
+        order, separator = ("txyp", ",") if "@" in header else ("txyp", " ")
+        path = tmp_path / "a.txt"
+        path.write_bytes(scenes.text(SCENE, order, separator, header))
+        assert open_events(path).declared == (48, 64)
+
+
+def test_two_conventions_of_off_in_one_file_are_refused(tmp_path):
+    with pytest.raises(InputError, match="one of them is OFF"):
+        read(tmp_path / "a.txt", b"10 1 2 1\n20 1 2 0\n30 1 2 -1\n")
+
+
+def test_arrays_under_other_names_and_with_labels(tmp_path):
+    np.savez(tmp_path / "a.npz", events=SCENE, label=3)
+    assert open_events(tmp_path / "a.npz").labels == ("label = 3",)
+    names = {"ts": SCENE["t"] / 1e6, "xs": SCENE["x"], "ys": SCENE["y"], "ps": SCENE["p"]}
+    np.savez(tmp_path / "b.npz", **names)
+    for name in ("a.npz", "b.npz"):
+        np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
+
+
+def test_a_small_file_that_unpacks_to_much_is_refused(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", t=np.zeros((1 << 27) + 1000, np.int64))
+    with pytest.raises(InputError, match="when unpacked, more than"):
+        open_events(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_evt21_in_both_word_orders(tmp_path, is_swapped):
+    data = scenes.evt21(SCENE, b"% evt 2.1\n% geometry 64x48\n% end\n", is_swapped=is_swapped)
+    np.testing.assert_array_equal(read(tmp_path / "a.raw", data), SCENE)
+    assert bool(open_events(tmp_path / "a.raw").assumptions) == is_swapped
+
+
+def test_evt4_with_vectors(tmp_path):
+    np.testing.assert_array_equal(read(tmp_path / "a.raw", scenes.evt4(SCENE, b"% evt 4.0\n% end\n")), SCENE)
+
+
+@pytest.mark.parametrize("bit", range(11))
+def test_a_flipped_bit_of_time_high_is_no_wrap(tmp_path, bit):
+    late = SCENE.copy()
+    late["t"] += 1 << 23 | 1 << 22
+    events = read(tmp_path / "a.raw", scenes.evt3(late, {300: 1 << bit}))
+    np.testing.assert_array_equal(np.delete(events, 300), np.delete(late, 300))
+
+
+def test_dat_goes_on_when_its_32_bits_wrap(tmp_path):
+    late = SCENE.copy()
+    late["t"] += (1 << 32) - 10_000
+    words = np.empty((600, 2), "<u4")
+    words[:, 0] = late["t"] & 0xFFFFFFFF
+    words[:, 1] = SCENE["x"] | SCENE["y"].astype("<u4") << 14 | SCENE["p"].astype("<u4") << 28
+    np.testing.assert_array_equal(read(tmp_path / "a.dat", b"% Version 2\n\x0c\x08" + words.tobytes()), late)
+
+
+def test_aedat_2_and_3(tmp_path):
+    for data in (scenes.aedat2(SCENE), scenes.aedat2(SCENE, "Davis346red"), scenes.aedat3(SCENE)):
+        np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), SCENE)
+
+
+def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
+    data = scenes.aedat3(SCENE)
+    for length in range(len(data) - 100, len(data), 7):
+        (tmp_path / "a.aedat").write_bytes(data[:length])
+        cut = read_events(tmp_path / "a.aedat")
+        np.testing.assert_array_equal(cut.events, SCENE[: len(cut.events)])
+        assert len(cut.events) > 580
+        assert "cut short" in cut.damage[0]
+
+
+class TestHdf5:
+    @pytest.fixture
+    def h5py(self):
+        return pytest.importorskip("h5py")
+
+    def test_layouts_of_data_sets(self, tmp_path, h5py):
+        pytest.importorskip("hdf5plugin")
+        with h5py.File(tmp_path / "dsec.h5", "w") as root:
+            for name in "xypt":
+                root[f"events/{name}"] = SCENE[name].astype("<u4")
+            root["t_offset"] = 49_599_300_000
+        events = read_events(tmp_path / "dsec.h5").events
+        np.testing.assert_array_equal(events["t"], SCENE["t"] + 49_599_300_000)
+        with h5py.File(tmp_path / "halves.h5", "w") as root:
+            for name in "xyp":
+                root[f"events/{name}"] = SCENE[name].astype("<u4")
+            root["events/t"], root["t_offset"] = SCENE["t"] + 0.5, 49_599_300_000
+        with pytest.raises(InputError, match=r"event 0: t = 100\.5, but must be whole"):
+            read_events(tmp_path / "halves.h5")
+        with h5py.File(tmp_path / "e2vid.h5", "w") as root:
+            root["events/ts"], root["events/ps"] = SCENE["t"] / 1e6, SCENE["p"].astype(bool)
+            root["events/xs"], root["events/ys"] = SCENE["x"], SCENE["y"]
+            root.attrs["sensor_resolution"] = (48, 64)
+        assert open_events(tmp_path / "e2vid.h5").declared == (48, 64)
+        with h5py.File(tmp_path / "v2e.h5", "w") as root:
+            root["events"] = scenes.table(SCENE, "txyp").astype("<u4")
+        with h5py.File(tmp_path / "mvsec.h5", "w") as root:
+            for side in ("left", "right"):
+                root[f"davis/{side}/events"] = scenes.table(SCENE, "xytp").astype(float)
+        for name in ("e2vid.h5", "v2e.h5", "mvsec.h5"):
+            np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
+        assert "davis/right/events" in open_events(tmp_path / "mvsec.h5").assumptions[0]
+
+    def test_half_of_the_tables(self, tmp_path, h5py):
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            root["events/x"], root["events/y"] = SCENE["x"], SCENE["y"]
+        with pytest.raises(InputError, match="events has x, y, but no t, p"):
+            open_events(tmp_path / "a.h5")
+
+    def test_several_streams_need_a_choice(self, tmp_path, h5py):
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            for camera in ("one", "two", "three"):
+                root[f"{camera}/events"] = SCENE
+        with pytest.raises(InputError, match=r"3 event streams \(.*--stream"):
+            open_events(tmp_path / "a.h5")
+        file = open_events(tmp_path / "a.h5", options=TableOptions(stream="two/events"))
+        np.testing.assert_array_equal(np.concatenate([*file]), SCENE)

@@ -1,0 +1,166 @@
+"""How the cost of events grows with filters, stride, resolution, rate, cameras and processes.
+
+Lives here: the part `growth`: loads timed in turns, the latency of single events and emissions, processes
+beside each other.
+Not here: what should come out (`growth_model`), a whole listener (`growth_fleet`), how it is shown (`tables`,
+`growth_picture`).
+"""
+
+import multiprocessing
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+import streamfeat as sf
+from streamfeat.events import Events
+from streamfeat.latency.stopwatch import follow_timed
+from streamfeat.report.machine import Disturbance
+from tools.bench.growth_fleet import measure_fleet
+from tools.bench.growth_model import Constants, work_of
+from tools.bench.growth_streams import FIT, Load, Stream, sweeps
+from tools.bench.material import Material, Setting
+from tools.bench.timing import Contestant, race
+
+__all__ = ["measure_growth"]
+
+Report = dict[str, Any]
+
+CHUNK = 256
+"""Events that one camera has before it is the next one's turn, under `event`."""
+
+
+class Run:
+    """Cameras that take turns in one process.
+
+    Args:
+        load: how many, and what.
+        stream: of each.
+    """
+
+    def __init__(self, load: Load, stream: Stream) -> None:
+        self._event, self._stream = load.emit == "event", stream
+        encoder = load.encoder()
+        self._engines = [sf.Engine(encoder, load.resolution) for _ in range(load.cameras)]
+        self.n = len(stream.events) * load.cameras
+
+    def go(self) -> None:
+        """The stream once, to all cameras."""
+        for part in self._parts():
+            for engine in self._engines:
+                if self._event:
+                    engine.follow(part)
+                else:
+                    engine.feed(part)
+                    engine.features()
+
+    def latencies(self) -> NDArray[np.float64]:
+        """The same, in nanoseconds of each event that is followed, or of each emission."""
+        found = []
+        for part in self._parts():
+            for engine in self._engines:
+                if self._event:
+                    found.append(follow_timed(engine, part)[0])
+                    continue
+                engine.feed(part)
+                begun = time.perf_counter_ns()
+                engine.features()
+                found.append(np.array([time.perf_counter_ns() - begun]))
+        return np.concatenate(found).astype(np.float64)
+
+    def go_on(self) -> None:
+        """Move on in time; with several cameras a stream is shared, and moved once."""
+        self._stream.go_on()
+
+    def _parts(self) -> Iterator[Events]:
+        if not self._event:
+            yield from self._stream.slices
+            return
+        for start in range(0, len(self._stream.events), CHUNK):
+            yield self._stream.events[start : start + CHUNK]
+
+
+def measure_growth(setting: Setting) -> Report:
+    """Every load, measured and predicted; then cameras of one listener, and processes side by side."""
+    quick, material = setting.quick, setting.material
+    report = _measure(material, sweeps(quick), 1 if quick else 9, 1000 if quick else 20_000, tails=not quick)
+    counts, seconds = ((1,), 0.2) if quick else ((1, 2, 4), 5.0)
+    constants, camera = Constants(**report["constants"]), Load("10ms", rate=100_000)
+    fleet = measure_fleet(material, camera, counts, seconds, constants, 1 if quick else 3)
+    processes = _measure_processes(material.path, Load("10ms"), counts[:2], seconds)
+    return report | {"fleet": fleet, "processes": processes}
+
+
+def _measure(material: Material, loads: list[Load], rounds: int, events: int, *, tails: bool) -> Report:
+    """Time loads in turns, fit the constants to the first ones, and predict all."""
+    disturbance = Disturbance()
+    works, contestants, runs = [], {}, []
+    for load in loads:
+        stream = Stream(material, load, events)
+        works.append(work_of(load, stream))
+        runs.append(Run(load, stream))
+        contestants[load.name] = Contestant(runs[-1].go, runs[-1].n, runs[-1].go_on)
+    with threadpool_limits(1):
+        result = race(contestants, rounds)
+    figures = [result.figure(load.name) for load in loads]
+    ns = [figure["p50"] for figure in figures]
+    fitted = [loads.index(load) for load in FIT]
+    constants = Constants.fit([works[i] for i in fitted], [ns[i] for i in fitted])
+    rows = []
+    for load, work, figure, run in zip(loads, works, figures, runs, strict=True):
+        predicted = constants.predict(work)
+        row = asdict(load) | asdict(work) | {"fitted": load in FIT, "ns": figure}
+        row |= {"predicted_ns": predicted, "ratio": figure["p50"] / predicted}
+        if tails:
+            p50, p99 = np.percentile(run.latencies(), [50, 99])
+            row |= {"latency_p50_us": p50 / 1e3, "latency_p99_us": p99 / 1e3}
+        rows.append(row)
+    return {
+        "steal": disturbance.steal_share(),
+        "discarded_rounds": result.discarded,
+        "recording": material.describe(),
+        "constants": asdict(constants),
+        "rows": rows,
+    }
+
+
+def _measure_processes(recording: Path, load: Load, counts: tuple[int, ...], seconds: float) -> Report:
+    """Events a second of so many processes at once, on the wall and by their own processor time."""
+    found = {}
+    context = multiprocessing.get_context("spawn")
+    for count in counts:
+        ready = context.Barrier(count)
+        disturbance = Disturbance()
+        with ProcessPoolExecutor(count, context, initializer=_share, initargs=(ready,)) as pool:
+            jobs = [pool.submit(_process, recording, load, seconds) for _ in range(count)]
+            taken = [job.result() for job in jobs]
+        events = sum(n for n, _, _ in taken)
+        found[str(count)] = {
+            "events_per_s": events / max(wall for _, wall, _ in taken),
+            "events_per_processor_s": events / sum(cpu for _, _, cpu in taken),
+            "steal": disturbance.steal_share(),
+        }
+    return {"load": load.name} | found
+
+
+def _share(ready: Any) -> None:
+    global _ready
+    _ready = ready
+
+
+def _process(recording: Path, load: Load, seconds: float) -> tuple[int, float, float]:
+    run = Run(load, Stream(Material(recording), load, 20_000))
+    run.go()
+    _ready.wait()
+    begun, cpu, n = time.perf_counter(), time.process_time(), 0
+    while time.perf_counter() - begun < seconds:
+        run.go_on()
+        run.go()
+        n += run.n
+    return n, time.perf_counter() - begun, time.process_time() - cpu

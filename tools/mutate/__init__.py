@@ -1,0 +1,1 @@
+"""Small faults, put in on purpose, that the tests must notice: `python -m tools.mutate`."""
