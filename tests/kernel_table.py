@@ -137,7 +137,7 @@ def exact_but_atoms(kernel: Run, twin: Run) -> None:
     if not operator.inverse:
         return exact_but_scratch(kernel, twin)
     for run in (kernel, twin):
-        naive.add_up(run.after[-1])
+        naive.add_up(len(run.after[-1].code), run.after[-1])
     assert_same(kernel.result, twin.result)
     assert_same(state, twin.after[-1], scratch=SCRATCH | {"atoms", "pooled"})
     assert_certified(operator, state)
@@ -149,12 +149,12 @@ def exact_but_atoms(kernel: Run, twin: Run) -> None:
 def exact_but_atoms_of_a_part(kernel: Run, twin: Run) -> None:
     """As above, once the other parts are complete as well."""
     for run in (kernel, twin):
-        part, operator, state = run.after
+        part, parts, operator, state = run.after
         if operator.inverse and state.projections.shape[1] > 1:
-            for other in range(len(state.code)):
+            for other in range(parts):
                 if other != part:
-                    naive.complete(other, operator, state)
-            naive.finish(operator, state)
+                    naive.complete(other, parts, operator, state)
+            naive.finish(parts, operator, state)
     exact_but_atoms(kernel, twin)
 
 
@@ -704,6 +704,12 @@ def random_part(rng, state):
     return int(rng.integers(0, len(state.code)))
 
 
+def random_share(rng, state):
+    """One of the parts of an update, and how many there are."""
+    parts = int(rng.integers(1, len(state.code) + 1))
+    return int(rng.integers(0, parts)), parts
+
+
 def random_most(rng):
     return int(pick(rng, [1, 3, 10**6]))
 
@@ -749,7 +755,7 @@ def make_fill_plane(rng):
 def make_complete(rng):
     operator, state = engine_with_a_plane_to_fill(rng)
     naive.list_missing(operator, state)
-    return random_part(rng, state), operator, state
+    return *random_share(rng, state), operator, state
 
 
 def make_count_filled(rng):
@@ -792,16 +798,16 @@ def make_mark_dirty(rng):
 def make_renew(rng):
     operator, state = engine_with_news(rng)
     naive.mark_dirty(operator, state)
-    return random_part(rng, state), operator, state
+    return *random_share(rng, state), operator, state
 
 
 def make_share_of(rng):
-    part, _, state = make_renew(rng)
-    return part, state
+    part, parts, _, state = make_renew(rng)
+    return part, parts, state
 
 
 def make_touched_bins(rng):
-    return (make_renew(rng)[2],)
+    return (make_renew(rng)[-1],)
 
 
 def make_settle(rng):
@@ -813,7 +819,7 @@ def make_settle(rng):
 def make_finish(rng):
     operator, state = engine_with_news(rng)
     state.partial[:] = rng.integers(-9, 10, state.partial.shape)
-    return operator, state
+    return int(rng.integers(1, len(state.code) + 1)), operator, state
 
 
 def changed_place(rng, operator, state):
@@ -904,6 +910,12 @@ def make_sum_columns(rng):
 
 def sums_only(kernel: Run, twin: Run) -> None:
     assert_same(kernel.after[-1], twin.after[-1])
+
+
+def make_add_moments(rng):
+    n, *_ = make_change_entries(rng)
+    changes = rng.integers(-(2**14) + 1, 2**14, n + 2).astype(np.int16)
+    return n, changes, rng.integers(-(2**40), 2**40, 4)
 
 
 def make_change_moments(rng):
@@ -1074,6 +1086,7 @@ KERNELS = [
     Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),
     Row(surfaces.time_surfaces, make_time_surfaces, close_surfaces),
     Row(volume.add_column, make_add_column),
+    Row(volume.add_moments, make_add_moments),
     Row(volume.change_moments, make_change_moments),
     Row(volume.sum_columns, make_sum_columns, sums_only),
     Row(volume.change_entries, make_change_entries, exact_but_sums),

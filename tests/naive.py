@@ -371,6 +371,10 @@ def sums_of(values, operator):
     return (v @ operator.columns.astype(np.int64)).astype(np.int32), moments
 
 
+def add_moments(n, changes, moments):
+    moments[:2] += sum(changes[:n].tolist()), sum(change**2 for change in changes[:n].tolist())
+
+
 def change_moments(n, entries, changes, values, operator, moments):
     d = len(operator.columns)
     _, before = sums_of(values[:d], operator)
@@ -504,37 +508,36 @@ def list_missing(operator, state):
     state.clock[CLOCK_DIRTY] = len(missing)
 
 
-def share_of(part, state):
-    n, parts = int(state.clock[CLOCK_DIRTY]), len(state.partial) + 1
+def share_of(part, parts, state):
+    n = int(state.clock[CLOCK_DIRTY])
     cuts = [math.floor(n * i / parts) for i in range(parts + 1)]
     return cuts[part], cuts[part + 1]
 
 
-def complete(part, operator, state):
+def complete(part, parts, operator, state):
     plane = int(state.clock[CLOCK_PLANE])
     cursors, everything = state.cursors[plane], len(operator.columns)
-    for volume in state.dirty[slice(*share_of(part, state))].tolist():
+    for volume in state.dirty[slice(*share_of(part, parts, state))].tolist():
         if volume >= cursors[CURSOR_PROJECTED]:
             project_volume(plane, volume, 0, 0, everything, part, operator, state)
         enter_code(plane, volume, part, operator, state)
 
 
-def add_up(state):
-    state.pooled[:] = state.pooled + state.partial.sum(axis=0, dtype=np.int32)
-    state.partial[:] = 0
+def add_up(parts, state):
+    state.pooled[:] = state.pooled + state.partial[: parts - 1].sum(axis=0, dtype=np.int32)
+    state.partial[: parts - 1] = 0
 
 
-def finish(operator, state):
-    add_up(state)
+def finish(parts, operator, state):
+    add_up(parts, state)
     state.cursors[int(state.clock[CLOCK_PLANE])] = volumes_of(operator), volumes_of(operator), 0
     state.clock[CLOCK_DIRTY] = 0
 
 
 def fill_plane(operator, state):
     list_missing(operator, state)
-    for part in range(len(state.code)):
-        complete(part, operator, state)
-    finish(operator, state)
+    complete(0, 1, operator, state)
+    finish(1, operator, state)
 
 
 def look_ahead(projected, coded, budget, operator, state):
@@ -612,8 +615,8 @@ def touched_bins(state):
     return min(touched, default=n_bins), max(touched, default=-1) + 1
 
 
-def renew(part, operator, state):
-    mine = state.dirty[slice(*share_of(part, state))].tolist()
+def renew(part, parts, operator, state):
+    mine = state.dirty[slice(*share_of(part, parts, state))].tolist()
     for plane, volume, values in list(_changed_volumes(_clipped(operator, state), operator, state)):
         if plane * volumes_of(operator) + volume in mine:
             _follow_volume(plane, volume, values, part, operator, state)
@@ -629,8 +632,7 @@ def settle(state):
 
 def update(operator, state):
     mark_dirty(operator, state)
-    for part in range(len(state.code)):
-        renew(part, operator, state)
+    renew(0, 1, operator, state)
     settle(state)
     fill_plane(operator, state)
 

@@ -1,5 +1,6 @@
 """The engine's contract: what it takes, what it refuses, what it hands out, and that it allocates nothing."""
 
+import os
 import sys
 import tracemalloc
 
@@ -8,7 +9,7 @@ import pytest
 from kernel_table import assert_certified
 from streams import EXACT_KINDS, KINDS, LASSO_KINDS, Case, random_events
 
-from streamfeat.engine import engine as engine_module
+from streamfeat.engine import threads
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine, EngineStats
 from streamfeat.engine.geometry import Geometry
@@ -531,7 +532,7 @@ def test_nothing_is_allocated_after_warm_up(kind):
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
 def test_any_number_of_threads_gives_what_one_gives(kind, look_ahead, monkeypatch):
-    monkeypatch.setattr(engine_module, "_WORTH_SHARING", 0)
+    monkeypatch.setattr(threads, "WORTH_A_PART", 1)
     case = known_case(kind)
     events = some_events(case)
     one = case.engine(look_ahead=look_ahead)
@@ -554,11 +555,32 @@ def test_any_number_of_threads_gives_what_one_gives(kind, look_ahead, monkeypatc
         assert engine.stats() == one.stats()
 
 
-@pytest.mark.parametrize("threads", [0, -1, 1000])
-def test_a_number_of_threads_that_makes_no_sense_is_refused(threads):
+@pytest.mark.parametrize("n", [0, -1, 1000])
+def test_a_number_of_threads_that_makes_no_sense_is_refused(n):
     case = known_case()
-    with pytest.raises(InputError, match=f"^{threads} threads: an engine uses 1 to 256$"):
-        Engine(case.encoder, case.resolution, threads=threads)
+    with pytest.raises(InputError, match=f"^{n} threads: an engine uses 1 to 256$"):
+        Engine(case.encoder, case.resolution, threads=n)
+
+
+def test_a_small_sensor_pays_nothing_for_threads(monkeypatch):
+    """It does all in one call, and starts no thread; the count of volumes decides, not the clock."""
+    monkeypatch.setattr(threads.Crew, "share", None)
+    case = known_case()
+    engine = Engine(case.encoder, case.resolution, threads=2)
+    engine.feed(some_events(case))
+    assert engine.features().any()
+    volumes = engine.grid_shape[0] * engine.grid_shape[1]
+    monkeypatch.setattr(threads, "WORTH_A_PART", 64 * volumes // 2)
+    engine.restart(0)
+    engine.feed(some_events(case))
+    with pytest.raises(TypeError):
+        engine.features()
+
+
+def test_cores_but_one_are_used_if_nothing_is_said(monkeypatch):
+    for cores, used in ((1, 1), (2, 1), (3, 2), (1000, 256)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda pid, n=cores: set(range(n)), raising=False)
+        assert threads.usable_threads() == used
 
 
 @pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)

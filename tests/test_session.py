@@ -8,6 +8,7 @@ import tiny
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures, encode_samples, sample_end
+from streamfeat.engine import threads
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
@@ -525,3 +526,17 @@ def test_looking_ahead_is_bounded_in_columns():
         session.rest()
     assert asked
     assert max(asked) <= 4096
+
+
+@pytest.mark.parametrize("policy", ["10ms", "auto"])
+def test_any_number_of_threads_makes_the_same_emissions(policy, monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_A_PART", 1)
+    items = [
+        tiny.packet(tiny.steady(start, start + 50_000, 2000, seed=start)) for start in (0, 50_000, 100_000)
+    ]
+    one, _ = run(items, policy)
+    three, session = run(items, policy, threads=3)
+    assert session._engine._crew.threads == 3
+    assert [e.t_us for e in three] == [e.t_us for e in one]
+    for mine, yours in zip(three, one, strict=True):
+        np.testing.assert_array_equal(mine.features, yours.features)

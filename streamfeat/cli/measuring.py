@@ -22,6 +22,7 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     StepsOption,
+    ThreadsOption,
     TopicOption,
     app,
     completing,
@@ -75,6 +76,7 @@ def latency(
         Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
     ] = None,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -99,6 +101,7 @@ def latency(
         seconds=seconds,
         speed=speed,
         look_ahead=look_ahead,
+        threads=threads,
     )
     print_assumptions(report.assumptions)
     try:

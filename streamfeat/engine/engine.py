@@ -8,8 +8,6 @@ pooled sums up to date with whatever has changed since. What is read depends on 
 time, never on how often it was read or how the stream was cut into batches.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +17,7 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.snapshot import Snapshot, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
-from streamfeat.errors import InputError
+from streamfeat.engine.threads import Crew
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow, trace
@@ -27,6 +25,7 @@ from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
+    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
@@ -36,20 +35,12 @@ from streamfeat.kernels.layout import (
     CURSOR_CODED,
     MOMENT_SQUARES,
     TALLY_EVENTS,
-    Operator,
-    State,
 )
 from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
 from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
 from streamfeat.report.shown import Shown
 
-__all__ = ["MOST_THREADS", "Engine", "EngineStats"]
-
-MOST_THREADS = 256
-
-_WORTH_SHARING = 1 << 20
-"""Filters times volumes or entries that changed: a millisecond of work at least, against a tenth of one for
-handing a part of it to another thread."""
+__all__ = ["Engine", "EngineStats"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +95,7 @@ class Engine(Shown):
         self.encoder = encoder
         self.resolution = resolution
         self.grid_shape = encoder.geometry.grid_shape(resolution)
-        if not 1 <= threads <= MOST_THREADS:
-            raise InputError(f"{threads} threads: an engine uses 1 to {MOST_THREADS}")
-        # A thread starts with the first large emission, and ends with the engine.
-        self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
+        self._crew = Crew(threads)
         self._operator = with_fixed_point(encoder.operator, self.grid_shape)
         self._state = allocate_state(
             encoder.geometry,
@@ -183,18 +171,21 @@ class Engine(Shown):
 
     def _update(self) -> None:
         """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
-        operator, state = self._operator, self._state
+        operator, state, crew = self._operator, self._state, self._crew
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
-        if self._others is None or not self._is_large:
+        filters = operator.offset.shape[0]
+        if crew.parts_for(self._most_volumes * filters) == 1:
             update(operator, state)
             return
         mark_dirty(operator, state)
-        self._share(renew)
+        renewing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
+        crew.share(renew, renewing, operator, state)
         settle(state)
         list_missing(operator, state)
-        self._share(complete)
-        finish(operator, state)
+        completing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
+        crew.share(complete, completing, operator, state)
+        finish(max(renewing, completing), operator, state)
 
     @property
     def _is_complete(self) -> bool:
@@ -203,19 +194,14 @@ class Engine(Shown):
         return bool(coded == self.grid_shape[0] * self.grid_shape[1])
 
     @property
-    def _is_large(self) -> bool:
-        volumes = 0 if self._is_complete else self.grid_shape[0] * self.grid_shape[1]
+    def _most_volumes(self) -> int:
+        """A bound of the volumes that an update has to work on."""
+        volumes = self.grid_shape[0] * self.grid_shape[1]
+        if not self._is_complete:
+            return volumes
+        covering = -((-self._operator.patch // self._operator.stride) ** 2)
         touched = int(self._state.clock[CLOCK_TOUCHED])
-        return bool(max(volumes, touched) * self._operator.offset.shape[0] >= _WORTH_SHARING)
-
-    def _share(self, work: Callable[[int, Operator, State], None]) -> None:
-        """Do the first part of some work here, and the other parts on other threads."""
-        operator, state, others = self._operator, self._state, self._others
-        assert others is not None
-        parts = [others.submit(work, part, operator, state) for part in range(1, len(state.code))]
-        work(0, operator, state)
-        for part in parts:
-            part.result()
+        return len(self._state.cursors) * min(volumes, touched * covering)
 
     @staticmethod
     def _checked(batch: Events) -> Events:
@@ -240,7 +226,7 @@ class Engine(Shown):
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._others is not None:
+        if self._crew.threads > 1:
             self._update()
         features = np.empty(n_features(self._operator), np.float32)
         read(self._operator, self._state, features)

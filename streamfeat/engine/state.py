@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.operator import aligned_zeros
 from streamfeat.events import Resolution
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
@@ -71,20 +72,20 @@ def allocate_state(
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
         encoded=np.zeros(threads, np.int64),
-        projections=np.zeros((planes, volumes, padded), np.int32),
+        projections=aligned_zeros((planes, volumes, padded), np.int32),
         moments=np.zeros((planes, volumes, 4), np.int64),
         atoms=np.zeros((planes, volumes, 2, atoms), np.float64),
-        pooled=np.zeros((planes, operator.pooling**2, features), np.int32),
-        partial=np.zeros((threads - 1, planes, operator.pooling**2, features), np.int32),
+        pooled=aligned_zeros((planes, operator.pooling**2, features), np.int32),
+        partial=aligned_zeros((threads - 1, planes, operator.pooling**2, features), np.int32),
         cells=_cells(operator.pooling, rows, columns),
         lines=np.zeros((2, ring[2] + 1), np.int32),
         crowds=np.zeros((ring[1] + 1, columns), np.int32),
         dirty=np.zeros(planes * rows * columns, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
-        code=np.zeros((threads, 3, padded), np.int32),
+        code=aligned_zeros((threads, 3, padded), np.int32),
         work=np.zeros((threads, 5, padded), np.float64),
         active=np.zeros((threads, padded), np.int64),
-        values=np.zeros((threads, 2, -(-geometry.entries // MASK_BITS) * MASK_BITS), np.int16),
+        values=aligned_zeros((threads, 2, -(-geometry.entries // MASK_BITS) * MASK_BITS), np.int16),
         entries=np.zeros((threads, geometry.entries + 1), np.int32),
         changes=np.zeros((threads, geometry.entries + 1), np.int16),
         corners=np.zeros((threads, atoms * padded), np.float32),

@@ -36,10 +36,13 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
-from streamfeat.kernels.volume import change_moments, gather_volume, list_entries, sum_columns
+from streamfeat.kernels.volume import add_moments, change_moments, gather_volume, list_entries, sum_columns
 
 CURRENT, NEXT = np.int64(0), np.int64(1)
 """Bins by which a plane is ahead."""
+
+FIRST, ALONE = np.int64(0), np.int64(1)
+"""The first part of an update, and how many there are where no thread shares it."""
 
 CODE_COST = 6
 """Columns that could be added while one volume is encoded and pooled."""
@@ -75,10 +78,6 @@ def project_volume(
     n, following = list_entries(values, start, end, entries, changes), end
     if n > most:
         n, following = most, np.int64(entries[most])
-    if operator.quadratic.shape[0]:
-        values[start:] = 0
-    for i in range(n):
-        values[entries[i]] = 0
     if start == 0:
         if n > 0 or moments[MOMENT_SQUARES] != 0:
             sum_columns(n, entries, changes, operator.columns, projection)
@@ -88,7 +87,11 @@ def project_volume(
         sum_columns(n, entries, changes, operator.columns, sums)
         for k in range(sums.shape[0]):
             projection[k] += sums[k]
-    change_moments(n, entries, changes, values, operator, moments)
+    if operator.quadratic.shape[0]:
+        values[start:] = 0
+        change_moments(n, entries, changes, values, operator, moments)
+    else:
+        add_moments(n, changes, moments)
     return n, following
 
 
@@ -180,24 +183,25 @@ def list_missing(operator: Operator, state: State) -> None:
 
 
 @inlined
-def share_of(part: int, state: State) -> tuple[int, int]:
-    """First and last plus one of the volumes on the dirty stack that a part of an update works on."""
-    n, parts = state.clock[CLOCK_DIRTY], state.code.shape[0]
+def share_of(part: int, parts: int, state: State) -> tuple[int, int]:
+    """First and last plus one of the volumes on the dirty stack that one of some parts works on."""
+    n = state.clock[CLOCK_DIRTY]
     return n * part // parts, n * (part + 1) // parts
 
 
 @kernel
-def complete(part: int, operator: Operator, state: State) -> None:
+def complete(part: int, parts: int, operator: Operator, state: State) -> None:
     """Let one part of the volumes that `list_missing` found enter the current plane.
 
     Args:
         part: which. The cursors stay, for the other parts to see.
+        parts: of how many.
         operator: the encoder.
         state: rows of these volumes, and sums and scratch of the part, are changed.
     """
     plane = state.clock[CLOCK_PLANE]
     cursors = state.cursors[plane]
-    first, last = share_of(part, state)
+    first, last = share_of(part, parts, state)
     for i in range(first, last):
         volume = np.int64(state.dirty[i])
         if volume >= cursors[CURSOR_PROJECTED]:
@@ -208,10 +212,10 @@ def complete(part: int, operator: Operator, state: State) -> None:
 
 
 @kernel
-def finish(operator: Operator, state: State) -> None:
+def finish(parts: int, operator: Operator, state: State) -> None:
     """All parts of an update are done: their sums are added up, and the current plane is complete."""
     volumes = operator.shape[0] * operator.shape[1]
-    for part in range(state.partial.shape[0]):
+    for part in range(parts - 1):
         for plane in range(state.pooled.shape[0]):
             for cell in range(state.pooled.shape[1]):
                 sums, more = state.pooled[plane, cell], state.partial[part, plane, cell]
@@ -225,11 +229,10 @@ def finish(operator: Operator, state: State) -> None:
 
 @kernel
 def fill_plane(operator: Operator, state: State) -> None:
-    """Let all volumes that are missing enter the current plane, one part after the other."""
+    """Let all volumes that are missing enter the current plane."""
     list_missing(operator, state)
-    for part in range(state.code.shape[0]):
-        complete(part, operator, state)
-    finish(operator, state)
+    complete(FIRST, ALONE, operator, state)
+    finish(ALONE, operator, state)
 
 
 @kernel

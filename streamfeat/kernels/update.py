@@ -25,7 +25,7 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
-from streamfeat.kernels.planes import fill_plane, share_of
+from streamfeat.kernels.planes import ALONE, FIRST, fill_plane, share_of
 from streamfeat.kernels.volume import gather_volume, list_entries
 
 
@@ -39,40 +39,39 @@ def mark_dirty(operator: Operator, state: State) -> None:
     """
     n_bins, height, width = state.counts.shape
     applied, counts, limit = state.applied.reshape(-1), state.counts.reshape(-1), operator.max_count
-    n_volumes, patch = operator.shape[0] * operator.shape[1], operator.patch
-    news = state.news.reshape(-1)
+    n_volumes, patch, columns = operator.shape[0] * operator.shape[1], operator.patch, operator.shape[1]
+    news, is_dirty, stride = state.news.reshape(-1), state.is_dirty, operator.stride
     state.touched_slots[:] = 0
-    n_dirty = 0
     for i in range(state.clock[CLOCK_TOUCHED]):
         place = state.touched[i]
         change = min(max(np.int64(counts[place]), -limit), limit) - applied[place]
         if change == 0:
             continue
         news[place] = change
-        slot = place // (height * width)
+        line = place // width
+        slot, row, column = line // height, line % height, place - line * width
         state.touched_slots[slot] = 1
-        row, column = place // width % height, place % width
-        first_row, last_row = state.volume_rows[row]
-        first_column, last_column = state.volume_columns[column]
+        first_row, last_row = state.volume_rows[row, 0], state.volume_rows[row, 1]
+        first_column, last_column = state.volume_columns[column, 0], state.volume_columns[column, 1]
         for plane in range(state.cursors.shape[0]):
             # The oldest bin of the window is at position 0 of a volume.
-            position = (slot - state.clock[CLOCK_SLOT] - 1) % n_bins - np.int64(
-                plane != state.clock[CLOCK_PLANE]
-            )
+            position = slot - state.clock[CLOCK_SLOT] - 1
+            position += n_bins if position < 0 else 0
+            position -= np.int64(plane != state.clock[CLOCK_PLANE])
             last, last_entry = state.cursors[plane, CURSOR_PROJECTED], state.cursors[plane, CURSOR_ENTRY]
-            if position < 0:
+            if position < 0 or last + last_entry == 0:
                 continue
             for r in range(first_row, last_row):
+                line_entry = (position * patch + row - r * stride) * patch + column
                 for c in range(first_column, last_column):
-                    volume = r * operator.shape[1] + c
-                    index = plane * n_volumes + volume
-                    top, left = r * operator.stride, c * operator.stride
-                    entry = (position * patch + row - top) * patch + column - left
-                    inside = volume < last or (volume == last and entry < last_entry)
-                    if inside and state.is_dirty[index] == 0:
-                        state.is_dirty[index] = 1
-                        state.dirty[n_dirty] = index
-                        n_dirty += 1
+                    volume = r * columns + c
+                    inside = volume < last or (volume == last and line_entry - c * stride < last_entry)
+                    is_dirty[plane * n_volumes + volume] |= inside
+    # Listed in the order of the volumes: neighbours in memory are neighbours on the sensor.
+    n_dirty = 0
+    for index in range(is_dirty.shape[0] if state.clock[CLOCK_TOUCHED] else 0):
+        state.dirty[n_dirty] = index
+        n_dirty += np.int64(is_dirty[index])
     state.clock[CLOCK_DIRTY] = n_dirty
 
 
@@ -88,18 +87,19 @@ def touched_bins(state: State) -> tuple[int, int]:
 
 
 @kernel
-def renew(part: int, operator: Operator, state: State) -> None:
+def renew(part: int, parts: int, operator: Operator, state: State) -> None:
     """Let one part of the dirty volumes follow the counts.
 
     Args:
         part: which.
+        parts: of how many.
         operator: the encoder.
         state: rows of these volumes, and sums and scratch of the part, are changed.
     """
     n_bins, patch, columns = state.counts.shape[0], operator.patch, operator.shape[1]
     values, news, n_volumes = state.values[part, 0], state.values[part, 1], operator.shape[0] * columns
     first_bin, last_bin = touched_bins(state)
-    first, last = share_of(part, state)
+    first, last = share_of(part, parts, state)
     for i in range(first, last):
         plane, volume = np.int64(state.dirty[i]) // n_volumes, np.int64(state.dirty[i]) % n_volumes
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
@@ -143,8 +143,7 @@ def update(operator: Operator, state: State) -> None:
         state: all of it may be changed.
     """
     mark_dirty(operator, state)
-    for part in range(state.code.shape[0]):
-        renew(part, operator, state)
+    renew(FIRST, ALONE, operator, state)
     settle(state)
     fill_plane(operator, state)
 

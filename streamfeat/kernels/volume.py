@@ -47,6 +47,24 @@ def sum_columns(
 
 
 @inlined
+def add_moments(n: int, changes: NDArray[np.int16], moments: NDArray[np.int64]) -> None:
+    """The same as `change_moments` for entries that were zero, without the forms.
+
+    Args:
+        n: length of the list.
+        changes: `(>= n,)` what the entries are from now on.
+        moments: `(4,)`, changed.
+    """
+    total, squares = np.int64(0), np.int64(0)
+    for i in range(n):
+        change = np.int64(changes[i])
+        total += change
+        squares += change * change
+    moments[MOMENT_SUM] += total
+    moments[MOMENT_SQUARES] += squares
+
+
+@inlined
 def change_moments(
     n: int,
     entries: NDArray[np.int32],
@@ -137,17 +155,25 @@ def gather_volume(
         patch: rows and columns of the volume.
         values: `(>= T * patch * patch,)`, overwritten in the lines that are copied.
     """
-    n_bins = ring.shape[0]
-    for line in range(start // patch, (end + patch - 1) // patch):
-        slot = first_slot + line // patch
-        pixels, at = ring[slot if slot < n_bins else slot - n_bins, top + line % patch], line * patch
-        if patch < EIGHT:
-            for column in range(patch):
-                values[at + column] = pixels[left + column]
-        else:
-            for column in range(0, patch - EIGHT + 1, EIGHT):
-                copy_eight(pixels, left + column, values, at + column)
-            copy_eight(pixels, left + patch - EIGHT, values, at + patch - EIGHT)
+    n_bins, height, width = ring.shape
+    pixels, line, last = ring.reshape(-1), start // patch, (end + patch - 1) // patch
+    while line < last:  # one bin after the other
+        position = line // patch
+        slot = first_slot + position
+        slot = slot if slot < n_bins else slot - n_bins
+        source = (slot * height + top + line - position * patch) * width + left
+        following = min(last, (position + 1) * patch)
+        for to in range(line * patch, following * patch, patch):
+            if patch < EIGHT:
+                for column in range(patch):
+                    values[to + column] = pixels[source + column]
+            else:
+                copy_eight(pixels, source, values, to)
+                for column in range(EIGHT, patch - EIGHT, EIGHT):
+                    copy_eight(pixels, source + column, values, to + column)
+                copy_eight(pixels, source + patch - EIGHT, values, to + patch - EIGHT)
+            source += width
+        line = following
 
 
 @kernel

@@ -7,6 +7,7 @@ Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, wh
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,7 @@ class Session:
         is_behind: whether the packet in hand has waited too long, given its `log_time_ns`.
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
+        threads: of the engines, see `Engine`.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -78,6 +80,7 @@ class Session:
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
+        threads: int = 1,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -92,7 +95,7 @@ class Session:
         self._clock, self._topic = clock, topic
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
-        self._make_engine = engine
+        self._make_engine = partial(engine, threads=threads)
         self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us

@@ -17,6 +17,7 @@ from typing import Any
 from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import replacing, write_atomically
 from streamfeat.files.locations import Location
@@ -66,6 +67,7 @@ class View:
         open_browser: show the page in a browser.
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
         loop: start a recording again at its end.
+        threads: that share a large emission, see `usable_threads`.
         say: told addresses, and what is waited for.
         options: further ones of `PlayJob`, `WatchJob` or `ListenJob`.
 
@@ -87,6 +89,7 @@ class View:
         open_browser: bool = False,
         speed: float | None = 1.0,
         loop: bool = False,
+        threads: int | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
@@ -95,6 +98,7 @@ class View:
             raise InputError(f"--rate {rate:g} is not possible; give up to {_MAX_RATE:g} pictures a second")
         if classifier and not model:
             raise InputError("a classifier reads features: give the model it was trained with, too (-m)")
+        threads = usable_threads(threads)
         self._encoder = Encoder.load(model) if model else None
         self._policy = EmitPolicy.parse(emit)
         reader = load_classifier(classifier) if classifier else None
@@ -128,6 +132,7 @@ class View:
                 loop=loop,
                 stays=self._is_served,
                 make_engine=self._engine_of(""),
+                threads=threads,
                 on_player=self._tell("player"),
                 on_timeline=self._tell("timeline") if web_port is not None else None,
                 **options,
@@ -139,6 +144,7 @@ class View:
                 classifier,
                 emit=emit,
                 engine_of=self._engine_of,
+                threads=threads,
                 tap=self._tap.items,
                 publish=False,
                 **options,

@@ -106,9 +106,7 @@ def _run(root: Path, path: Path, stride: int, resolution: tuple[int, int], threa
 
 
 def work(path: str, stride: int, resolution: tuple[int, int], threads: int) -> dict[str, Any]:
-    """Emit every 10 ms: mean milliseconds of the clock and of the processor that `features()` takes, and a digest
-    of the bits.
-    """
+    """Emit every 10 ms; mean milliseconds that `features()` takes, of the clock and of the processor."""
     import streamfeat as sf
 
     geometry, rng = sf.Geometry(stride=stride), np.random.default_rng(0)
