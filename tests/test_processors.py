@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 from streams import EXACT_KINDS, Case, random_events
 
 from streamfeat.engine.engine import Engine
@@ -43,11 +42,8 @@ def digests():
     return found
 
 
-@pytest.mark.parametrize("processor", ["generic", "haswell"])
-def test_features_have_the_same_bits_on_another_processor(processor):
-    environment = os.environ | {"NUMBA_CPU_NAME": processor}
-    if processor != "generic":
-        environment["NUMBA_CPU_FEATURES"] = "+avx2,+fma"
+def test_features_have_the_same_bits_on_a_processor_without_wide_vectors():
+    environment = os.environ | {"NUMBA_CPU_NAME": "generic"}
     done = subprocess.run(
         [sys.executable, __file__], env=environment, capture_output=True, text=True, check=False
     )
