@@ -1,5 +1,6 @@
 """Labels from a topic of the recording, and from a camera file itself."""
 
+import contextlib
 import struct
 
 import numpy as np
@@ -127,10 +128,8 @@ def test_numbers_are_texts(name, code, value, layout):
 def test_a_message_cut_short_is_refused_and_none_is_believed(kind, layout):
     whole = {STRING: string}.get(kind, stamped if "Stamped" in kind else classification)("left", 5)
     for n in range(len(whole)):
-        try:
+        with contextlib.suppress(InputError):  # nothing else may come of it
             parse_text(kind, whole[:n], layout)
-        except InputError as error:
-            assert kind in str(error)
     with pytest.raises(InputError):
         parse_text(kind, b"", layout)
 
