@@ -23,6 +23,7 @@ ROOMS = {
     "work": {"errors"},
     "report": {"errors", "files"},
     "engine": {"errors", "events", "files", "kernels", "report"},
+    "shipped": {"engine"},
     "messages": {"errors", "events", "files", "kernels"},
     "denoise": {"errors", "events", "kernels", "messages"},
     "simulate": {"events"},
@@ -51,6 +52,7 @@ ROOMS = {
         "kernels",
         "messages",
         "recordings",
+        "shipped",
     },
     "evaluate": ALL_ABOVE,
     "latency": ALL_ABOVE,
@@ -251,7 +253,7 @@ def test_what_a_module_offers_exists_and_is_described(name):
 
 
 def test_the_package_offers_about_twenty_names():
-    assert len(streamfeat.__all__) <= 22
+    assert len(streamfeat.__all__) <= 23
     assert set(streamfeat.__all__) == {*streamfeat._HOMES, "__version__"}
     assert set(dir(streamfeat)) >= set(streamfeat.__all__)
 

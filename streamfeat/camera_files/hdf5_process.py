@@ -150,7 +150,7 @@ def _tables(h5py: Any, root: Any) -> tuple[_Tables, list[str]]:
             elif isinstance(thing, h5py.Dataset) and thing.ndim == 2 and thing.shape[1] == 4:
                 if "event" in key.lower() or name == key:
                     tables[name] = [thing], None
-            elif isinstance(thing, h5py.Dataset) and thing.ndim == 1:
+            elif isinstance(thing, h5py.Dataset) and (thing.ndim == 1 or thing.shape[1:] == (1,)):
                 field, _ = field_of(key)
                 if field and field not in found:
                     found[field] = (key, thing)
@@ -215,7 +215,7 @@ def _about(
 def _check(h5py: Any, root: Any, dataset: Any) -> None:
     """Refuse a dataset that is not in this file, whose codec is missing, or that claims too much.
 
-    A dataset may say that its bytes are in any other file, and claim any number of rows that nobody wrote.
+    A dataset may say that its bytes are in any other file, and claim rows that were never written.
     """
     if dataset.external or dataset.is_virtual or dataset.file.filename != root.filename:
         raise InputError("keeps its events in another file; convert that one")

@@ -4,7 +4,6 @@ Lives here: its arguments, and how its result is shown.
 Not here: the evaluation (`streamfeat.evaluate`).
 """
 
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
     working,
@@ -54,9 +54,22 @@ def evaluate(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
     methods: Annotated[
-        list[str],
-        typer.Option("--method", help="direct, inverse, kmeans, random, hats, hots, counts; repeat it."),
-    ] = ["direct", "inverse"],  # noqa: B006  (Typer's way; it is never changed)
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            show_default="direct and inverse; model with -m",
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            "-m",
+            help="What --method model takes: a model, whose filters are not learned anew.",
+            show_default="the general one",
+        ),
+    ] = None,
     sweeps: Annotated[
         list[str] | None,
         typer.Option(
@@ -85,6 +98,8 @@ def evaluate(
     iterations: options.Iterations = None,
     seed: options.Seed = None,
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     on: Annotated[
         str,
@@ -126,10 +141,19 @@ def evaluate(
         raise InputError(f"--early-samples {early_samples} is not possible; give 0 or more")
     for path in (output, page):
         if path:
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel}
+    base = options.setting_given(context) | {
+        "mirror": mirror,
+        "cuts": cuts,
+        "shift": shift,
+        "kernel": kernel,
+        "model": str(model or ""),
+    }
+    methods = methods or (["model"] if model else ["direct", "inverse"])
+    if model and "model" not in methods:
+        raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
@@ -163,7 +187,7 @@ def evaluate(
     if output:
         save_result(output, result)
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json("evaluate", result)
     else:
         _print(result)
 

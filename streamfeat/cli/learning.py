@@ -27,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     print_losses,
     print_result,
     progress_bars,
@@ -106,7 +107,7 @@ def learn(
     from streamfeat.learn.settings import Setting
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(model, overwrite=overwrite or model == resume)
+    refuse_existing(model, *recordings, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
@@ -133,7 +134,7 @@ def learn(
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
-        "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
+        "objective": [encoder.provenance["objective"][0], encoder.provenance["objective"][-1]],
         "condition": encoder.provenance["condition"][-1],
         "coherence": encoder.provenance["coherence"][-1],
         "unused": encoder.provenance["unused"],
@@ -141,10 +142,8 @@ def learn(
     }
     entries = encoder.geometry.entries
     if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
-        result["log_determinant"] = (
-            f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
-        )
-    print_result(result, "learned", as_json=as_json)
+        result["log_determinant"] = "A XX' A'"
+    print_result(result, "learned", as_json=as_json, command="learn")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
@@ -185,11 +184,13 @@ def _keeper(path: Path) -> "Keep":
 def train(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
-    model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
+    model: ModelOption = None,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
@@ -206,14 +207,16 @@ def train(
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
     from streamfeat.classify.kernel import train_kernel_classifier
+    from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(classifier, overwrite=overwrite)
+    refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
+    variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
-    encoder = Encoder.load(model)
+    encoder = Encoder.load(model_or_general(model))
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:
@@ -228,14 +231,13 @@ def train(
         samples = encode_recordings(encoder, opened, report, workers=place)
         if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
-        images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
+        others = [encode_recordings(encoder, opened, report, variant=v, workers=place) for v in variants]
         report("training", 0, 0, f"{folds}-fold cross-validation")
-        rows, labels, numbers = training_set(samples, images)
+        rows, labels, numbers = training_set(samples, others)
         sources = samples.sources[~samples.held_out].tolist()
         parts = assign_folds(labels[: len(sources)], sources, folds, kind)
-        trained = train_classifier(
-            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
-        )
+        made_from = {"variants": [str(v) for v in variants], "groups": kind}
+        trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
     found: Classifier | KernelClassifier = trained
     if kernel == "rbf":
         found = train_kernel_classifier(rows, trained, np.asarray(labels))
@@ -243,7 +245,7 @@ def train(
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
-        "labels": ", ".join(trained.labels),
+        "labels": list(trained.labels),
         "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
@@ -253,7 +255,7 @@ def train(
         predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
-    print_result(result, "trained", as_json=as_json)
+    print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from streamfeat.cli.program import err, out, print_result, progress_bars
+from streamfeat.cli.program import err, out, print_json, progress_bars
 from streamfeat.errors import InputError, printable
 from streamfeat.files.locations import Location, location_of
 
@@ -42,7 +42,7 @@ def print_overview(
             report("reading", done, len(recordings), str(place))
             rows += _rows_of(place, topic, reading)
     if as_json:
-        print_result({"recordings": rows}, "", as_json=True)
+        print_json("info REC REC", {"recordings": rows})
     else:
         _print_table([row for row in rows if "error" not in row])
         for row in rows:

@@ -1,7 +1,7 @@
 """Commands that run the main job: replay.
 
 Lives here: their arguments, and how their results are shown.
-Not here: the job (`replay`).
+Not here: the job (`stream.replay`).
 """
 
 import sys
@@ -21,6 +21,7 @@ from streamfeat.cli.program import (
     TopicOption,
     VerboseOption,
     app,
+    model_or_general,
     out,
     print_losses,
     print_result,
@@ -42,12 +43,12 @@ __all__ = ["replay"]
 @reads_recordings()
 def replay(
     recording: RecordingArgument,
-    model: ModelOption,
     reading: "ReadOptions",
+    model: ModelOption = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: EmitOption = "auto",
+    emit: EmitOption = "bin",
     speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
@@ -77,10 +78,10 @@ def replay(
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, recording, model, classifier, overwrite=overwrite)
     job = ReplayJob(
         recording,
-        model,
+        model_or_general(model),
         classifier,
         emit=emit,
         speed=parse_speed(speed),
@@ -104,7 +105,7 @@ def replay(
             report,
         )
     if not to_terminal:
-        print_result(job.result(), "replayed", as_json=as_json)
+        print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
     if job.interrupted:
         raise typer.Exit(130)

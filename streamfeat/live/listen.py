@@ -57,7 +57,7 @@ class ListenJob:
 
     Args:
         names: of the topics.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of one to predict with, or the classifier; features alone without it.
         emit: when to emit, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
@@ -86,7 +86,7 @@ class ListenJob:
     def __init__(
         self,
         names: Names,
-        model: ModelSource,
+        model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
         emit: str | EmitPolicy = "auto",
@@ -200,7 +200,10 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+                n_filters = self._encoder.n_filters
+                return lines.open(
+                    self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
+                )
 
             with self.opened(sinks) as pipeline:
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
@@ -267,7 +270,7 @@ def _recording_sink(path: Path) -> RecordingSink:
 
 def listen(
     topics: str,
-    model: ModelSource,
+    model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
     emit: str | EmitPolicy = "auto",
@@ -294,7 +297,7 @@ def listen(
     Args:
         topics: zenoh key expression, such as `robot/*/events`; or a ROS 2 topic (rmw_zenoh), with its slash
             in front.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
         emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
         ros_domain: ROS_DOMAIN_ID, of a ROS 2 topic.

@@ -61,7 +61,7 @@ def parse_text(schema: str, data: bytes | memoryview, layout: str = "cdr") -> Te
     if kind == "Bool":
         return Text("true" if reader.number("B") else "false", 0)
     if kind in _NUMBERS:
-        return Text(f"{reader.number(_NUMBERS[kind]):.0f}", 0)
+        return Text(str(reader.number(_NUMBERS[kind])), 0)
     stamp_ns = reader.stamp_ns()
     if schema == _STAMPED:
         return Text(reader.text(), stamp_ns)

@@ -1,4 +1,4 @@
-"""What a recording is read from, whatever its format: the protocol that files, bags and tables follow.
+"""Sources of recordings, of any format: the protocol that files, bags and tables follow.
 
 Lives here: `Source`, `Topic`, `Part`, and `StoredMessage`, which a source of messages gives.
 Not here: any one format (`mcap_source`), which of them a path has (`opening`), decoding and time (`reader`).
@@ -87,7 +87,7 @@ class StoredMessage(NamedTuple):
 
 
 SourceItem = StoredMessage | Packet | Label
-"""What a source gives: messages that are still to be decoded, or packets and labels that are decoded."""
+"""An item of a source: a message still to be decoded, or a packet or label that is decoded."""
 
 
 class Source(Protocol):

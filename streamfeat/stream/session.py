@@ -83,7 +83,7 @@ class Session:
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
-        self.policy = policy
+        self.policy = policy = policy.with_bins(encoder.geometry.bin_us)
         self._every_event = policy == EmitPolicy("events", 1)
         if classifier and (learn_online or self._every_event):
             classifier = classifier.linear
@@ -292,7 +292,12 @@ class Session:
             topic=self._topic,
             incomplete=incomplete,
             source_ns=self._source_ns,
+            active_volumes=self._active_volumes(),
         )
+
+    def _active_volumes(self) -> int | None:
+        """Counting them is nothing beside an emission, but much beside one event."""
+        return self._engine.stats().active_volumes if self._engine and not self._every_event else None
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)
