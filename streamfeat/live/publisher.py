@@ -115,7 +115,8 @@ def _identity(
     """Tokens of a publisher, and the 16 bytes that name it."""
     if isinstance(names, RosNames):
         zid = str(session.zid())
-        token = ros_entity_token(names.domain, zid, entity, "MP", "streamfeat", topic, schema)
+        about = "MP", "streamfeat", topic, schema
+        token = ros_entity_token(names.domain, zid, entity, *about, has_hashes=names.has_hashes)
         return [ros_entity_token(names.domain, zid, 0, "NN", "streamfeat"), token], gid_of(token)
     gid = os.urandom(16)
     if isinstance(names, PlainNames) and schema == EventPacket.SCHEMA_NAME:

@@ -151,7 +151,8 @@ class Subscription:
         tokens = [ros_entity_token(names.domain, zid, 0, "NN", "streamfeat_listener")]
         if "*" not in names.expression:
             subscribed = (names.expression, EVENT_SCHEMAS[0])
-            tokens.append(ros_entity_token(names.domain, zid, 10, "MS", "streamfeat_listener", *subscribed))
+            about = names.domain, zid, 10, "MS", "streamfeat_listener", *subscribed
+            tokens.append(ros_entity_token(*about, has_hashes=names.has_hashes))
         self._open += [liveliness.declare_token(token) for token in tokens]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
