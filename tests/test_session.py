@@ -531,6 +531,7 @@ def test_looking_ahead_is_bounded_in_columns():
 @pytest.mark.parametrize("policy", ["10ms", "auto"])
 def test_any_number_of_threads_makes_the_same_emissions(policy, monkeypatch):
     monkeypatch.setattr(threads, "WORTH_A_PART", 1)
+    monkeypatch.setattr(threads, "WORTH_COUNTING", 0)
     items = [
         tiny.packet(tiny.steady(start, start + 50_000, 2000, seed=start)) for start in (0, 50_000, 100_000)
     ]
