@@ -22,7 +22,7 @@ from streamfeat.errors import InputError
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.intake import SILENCE_S, Intake
 from streamfeat.live.names import Names, PlainNames, RosNames, beside
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import OutputSink
@@ -30,6 +30,7 @@ from streamfeat.live.screen import HealthTable
 from streamfeat.live.shard import Shard
 from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import Barrier
+from streamfeat.live.warnings import Warnings
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy

@@ -18,11 +18,11 @@ from rich.console import Console
 
 from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import MAX_TOPICS
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.delivery import Delivery, DeliveryStats
 from streamfeat.recordings.writer import RecordingWriter

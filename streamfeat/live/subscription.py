@@ -17,9 +17,9 @@ from zenoh.handlers import Callback
 
 from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, RosNames, ros_entity_token
 from streamfeat.live.network import first_line, is_of
+from streamfeat.live.refusals import MAX_PAYLOAD_BYTES
 from streamfeat.live.shard import Shard
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages.packets import EVENT_SCHEMAS

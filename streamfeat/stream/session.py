@@ -159,6 +159,8 @@ class Session:
         self._log_time_ns, self._source_ns = packet.log_time_ns, packet.source_ns
         events = packet.events
         if len(events) == 0:
+            if packet.until_us is not None:
+                yield from self._pass_time(packet.until_us)
             return
         engine = self._engine_for(packet.resolution)
         valid = _valid(events, packet.resolution)

@@ -23,7 +23,8 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
-from streamfeat.messages.packets import Packet, PacketReader, Watermark
+from streamfeat.messages.packets import Packet, Watermark
+from streamfeat.messages.timeline import Timeline
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
@@ -81,11 +82,11 @@ def _stream(packets: int, seed: int) -> Iterator[Packet | Watermark]:
         t[0] = 0
         x, y, p = (rng.integers(0, most, _EVENTS) for most in (width, height, 2))
         bases.append(encode(make_events(x, y, p, t), "mono")[0])
-    reader, now_us = PacketReader("/events"), 0
+    timeline, now_us = Timeline("/events"), 0
     for i in range(packets):
         about = 0, "", height, width, i, now_us * 1000, "mono", False
         message = EventPacket(*about, bases[i % _BASES]).to_cdr()
-        yield reader.read(EventPacket.SCHEMA_NAME, message, 0, i)
+        yield from timeline.message(EventPacket.SCHEMA_NAME, message, now_us * 1000, i)
         now_us += _PACKET_US
         if i % 10 == 9:
             if i % 20 == 9:  # in the other silences nobody says that time goes on

@@ -22,7 +22,7 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
 from streamfeat.live.names import (
     Attachment,
     Names,
@@ -33,6 +33,7 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
 from streamfeat.messages.packets import EVENT_SCHEMAS, Packet
