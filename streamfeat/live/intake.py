@@ -22,13 +22,7 @@ from streamfeat.files.json_fields import Fields
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
 from streamfeat.live.names import Attachment, beside
 from streamfeat.live.refusals import RefusalError, checked_label, parsed
-from streamfeat.live.topic import (
-    MAX_LIVE_PACKET_EVENTS,
-    MAX_TOPIC_LENGTH,
-    MAX_TOPICS,
-    Barrier,
-    TopicState,
-)
+from streamfeat.live.topic import MAX_LIVE_PACKET_EVENTS, MAX_TOPICS, Barrier, TopicState
 from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.delivery import DeliveryStats, Verdict
@@ -216,7 +210,7 @@ class Intake:
     def _label(self, message: RawMessage) -> Iterator[Item]:
         """Give a label to the camera beside it, now or when its first packet comes."""
         parent = message.topic.rpartition("/")[0]
-        label = checked_label(message.payload)
+        label = checked_label(message)
         for topic in (parent, f"{parent}/events".lstrip("/"), f"{parent}/events"):
             state = self.topics.get(topic)
             if state and state.timeline.reached_us is not None:
@@ -330,8 +324,6 @@ class Intake:
 
     def _make_room(self, topic: str) -> Iterator[Item]:
         """See that one topic more can be followed; one that has been silent for long makes room for it."""
-        if len(topic) > MAX_TOPIC_LENGTH:
-            raise RefusalError("bad name", f"{len(topic)} characters, at most {MAX_TOPIC_LENGTH}")
         other = self._outputs.get(beside(topic, ""))
         if other is not None:
             raise RefusalError("one name for two outputs", f"{beside(topic, 'features')} is that of {other}")

@@ -169,7 +169,7 @@ class ListenJob:
             checkpointed: list[Sink[Emission]] = []
             published: list[Sink[Emission]] = []
             if self._publish:
-                published = [OutputSink(session, self._names, self.health.on_published)]
+                published = [OutputSink(session, self._names, self.health.on_published, self._on_unpublished)]
             written = sinks()
             if self._state:
                 # Last of the sinks: what it keeps says that all others have written.
@@ -247,6 +247,9 @@ class ListenJob:
 
     def _is_behind(self, log_time_ns: int) -> bool:
         return time.time_ns() - log_time_ns > self._patience_ns
+
+    def _on_unpublished(self, topic: str, error: str) -> None:
+        self._warnings.add("not published", topic, error)
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
         self._warnings.add(reason, topic, error)

@@ -16,7 +16,6 @@ from streamfeat.messages.timeline import Timeline
 __all__ = [
     "MAX_LIVE_PACKET_EVENTS",
     "MAX_TOPICS",
-    "MAX_TOPIC_LENGTH",
     "Barrier",
     "TopicState",
     "resolution_in",
@@ -24,8 +23,6 @@ __all__ = [
 
 MAX_LIVE_PACKET_EVENTS = 1 << 20
 MAX_TOPICS = 256
-MAX_TOPIC_LENGTH = 1024
-"""Characters of a name; longer ones are refused."""
 _LATEST_US = 1 << 52
 """No snapshot holds a later time."""
 

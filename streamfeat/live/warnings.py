@@ -12,7 +12,12 @@ from typing import Self
 
 from rich.console import Console
 
+from streamfeat.errors import printable
+
 __all__ = ["Warnings"]
+
+_SHOWN = 200
+"""Characters of a name in a line."""
 
 
 class Warnings:
@@ -49,4 +54,6 @@ class Warnings:
             return
         self._next[reason] = now + 1.0
         more = self._silent.pop(reason, 0)
-        self._say(f"{reason}: {topic}: {detail}" + (f" ({more} more of these)" if more else ""))
+        # Names and details come from the network.
+        said = printable(f"{reason}: {topic[:_SHOWN]}: {detail}")
+        self._say(said + (f" ({more} more of these)" if more else ""))
