@@ -102,6 +102,115 @@ def time_span(events, height, width, span):
     return len(t)
 
 
+# streamfeat.kernels.file_codes
+
+
+def decode_event_stream(data, is_atis, state, out):
+    t, crossings, _ = (int(v) for v in state)
+    data, at, events = data.tolist(), 0, []
+    bits = 6 if is_atis else 7
+    top = 2**bits - 1
+    while at < len(data):
+        time, rest = divmod(data[at], 2 ** (8 - bits))
+        if time == top:
+            t += top * rest
+            at += 1
+            continue
+        if len(data) - at < 5:
+            break
+        t += time
+        address = data[at + 1] + 256 * data[at + 2], data[at + 3] + 256 * data[at + 4]
+        if is_atis and rest % 2 == 1:
+            crossings += 1
+        else:
+            events.append((*address, rest // 2 if is_atis else rest, t))
+        at += 5
+    state[:] = t, crossings, at
+    return _write(events, out)
+
+
+def decode_ecf(data, size, out):
+    bytes_ = data.tolist()
+    at, n = 12, len(out)
+    t = int.from_bytes(bytes(bytes_[4:12]), "little", signed=True)
+    times = []
+    while len(times) < n:
+        if at >= size:
+            return -1 - at
+        step, run = divmod(bytes_[at], 16)
+        if step == 15:
+            nibbles = []
+            while bytes_[at] >= 0xF0 and len(nibbles) < 16:
+                nibbles.append(bytes_[at] % 16)
+                at += 1
+            t += sum(nibble << 4 * k for k, nibble in enumerate(nibbles))
+            continue
+        t += step
+        if run == 15:
+            run = bytes_[at + 1] + 256 * bytes_[at + 2]
+            at += 2
+        if run > n - len(times):
+            return -1 - at
+        times += run * [(t + 2**63) % 2**64 - 2**63]
+        at += 1
+    out["t"] = times
+    if bytes_[0] // 2 % 2:
+        return decode_groups(data, size, at, 24, out)
+    at = _ecf_runs(bytes_, size, at, 2, 5, out["y"])
+    if at < 0 or bytes_[0] % 2:
+        return at if at < 0 else decode_groups(data, size, at, 12, out)
+    columns = []
+    while len(columns) < n:
+        if at >= size:
+            return -1 - at
+        word = bytes_[at] + 256 * bytes_[at + 1]
+        columns += [word // 32] + [word // 32 + k for k in range(1, 6) if word % 32 & 2 ** (5 - k)]
+        at += 2
+    out["x"] = columns[:n]
+    at = _ecf_runs(bytes_, size, at, 1, 7, out["p"])
+    return -1 - at if at > size else at
+
+
+def _ecf_runs(data, size, at, width, bits, column):
+    values = []
+    while len(values) < len(column):
+        if at >= size:
+            return -1 - at
+        value, run = divmod(data[at] + (256 * data[at + 1] if width == 2 else 0), 2**bits)
+        if run == 2**bits - 1:
+            run = data[at + width] + 256 * data[at + width + 1]
+            at += 2
+        if run > len(column) - len(values):
+            return -1 - at
+        values += run * [value]
+        at += width
+    column[:] = values
+    return at
+
+
+def decode_groups(data, size, at, bits, out):
+    width = bits // 6
+    for i in range(0, len(out), 4):
+        if at + 3 * width > size:
+            return -1 - at
+        words = [int.from_bytes(data[at + k * width :][:width].tobytes(), "little") for k in range(3)]
+        digits = [f"{word:0{8 * width}b}" for word in words]
+        third = bits // 3
+        values = (
+            digits[0][:bits],
+            digits[1][: 2 * third] + digits[0][bits:],
+            digits[2][:third] + digits[1][2 * third :],
+            digits[2][third:],
+        )
+        for event, text in zip(out[i : i + 4], values, strict=False):
+            value = int(text, 2)
+            event["p"], event["x"] = value % 2, value // 2 % 2048
+            if bits == 24:
+                event["y"] = value // 4096 % 2048
+        at += 3 * width
+    return at
+
+
 def _write(events, out):
     for i, event in enumerate(events):
         out[i] = event

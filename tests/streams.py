@@ -162,6 +162,14 @@ def fed_in_every_way(make_engine, events, rng):
             told_the_time.advance(latest)
     yield "told the time after each event", told_the_time
 
+    prepared = make_engine(look_ahead=True)
+    end = 0
+    while end < len(events):  # so little that most pieces end within a volume
+        start, end = end, end + int(rng.integers(1, 4))
+        prepared.feed(events[start:end])
+        prepared.prepare(int(rng.integers(1, 13)))
+    yield "prepared in small pieces", prepared
+
     for look_ahead in (False, True):
         how = ", looking ahead" if look_ahead else ""
 

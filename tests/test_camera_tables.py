@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from streamfeat.camera_files.event_files import open_events, read_events
 from streamfeat.camera_files.source import TableOptions
 from streamfeat.errors import InputError
+from streamfeat.events import make_events
 
 SCENE = scenes.scene()
 NAMES = {"x": ["x", "X", "x@64", "xs"], "y": ["y", "Y", "y@48", "ys"], "p": ["p", "pol", "on", "Polarity"]}
@@ -145,6 +146,97 @@ def test_aedat_2_and_3(tmp_path):
         np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), SCENE)
 
 
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (scenes.aedat2(SCENE), "2.0 addresses of a DVS128, as they stand, because the header names no chip"),
+        (scenes.aedat2(SCENE, "DVS128"), "ON where bit 0 is clear, as jAER has it"),
+        (scenes.aedat1(SCENE), "1.0 addresses of a DVS128, as they stand"),
+        (scenes.aedat1(SCENE, b"# made by hand\r\n"), "it names no version"),
+        (scenes.aedat1(SCENE, b""), "it names no version"),
+        (
+            scenes.aedat1(SCENE, b"#!AER-DAT1.0\r\n# AEChip: ch.unizh.ini.jaer.DVS128\r\n", is_turned=True),
+            "x is mirrored, y from the bottom",
+        ),
+    ],
+)
+def test_a_dvs128_is_turned_where_it_is_named_and_that_is_said(tmp_path, data, said):
+    np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), SCENE)
+    file = open_events(tmp_path / "a.aedat")
+    assert any(said in line for line in file.assumptions)
+    assert file.declared == (128, 128)
+
+
+def test_an_address_that_begins_like_a_header_line_is_no_header(tmp_path):
+    rows = make_events([5] * 90, [0x23] * 90, [1] * 90, range(10, 100))  # 10 is the end of a line
+    for data in (scenes.aedat1(rows), scenes.aedat1(rows, b"")):
+        np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), rows)
+
+
+def test_aedat_1_that_is_something_else_is_refused(tmp_path):
+    garbage = np.random.default_rng(1).bytes(6_000)
+    with pytest.raises(InputError, match="time goes back"):
+        read(tmp_path / "a.aedat", garbage)
+    with pytest.raises(InputError, match="hold none of a davis346"):
+        read(tmp_path / "a.aedat", b"#!AER-DAT1.0\r\n# AEChip: x.Davis346red\r\n")
+
+
+class TestEventStream:
+    @pytest.mark.parametrize("is_atis", [False, True])
+    def test_events_of_both_kinds_in_blocks(self, tmp_path, is_atis):
+        n = 230_000  # more than one block
+        rng = np.random.default_rng(2)
+        t = np.cumsum(rng.choice([0, 1, 62, 63, 126, 127, 128, 400], n))
+        events = make_events(rng.integers(0, 64, n), rng.integers(0, 48, n), rng.integers(0, 2, n), t)
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(events, is_atis=is_atis))
+        batches = [*open_events(tmp_path / "a.es")]
+        assert len(batches) > 1
+        np.testing.assert_array_equal(np.concatenate(batches), events)
+        assert open_events(tmp_path / "a.es").declared == (48, 64)
+
+    def test_an_event_cut_in_two_is_counted(self, tmp_path):
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(SCENE)[:-2])
+        cut = read_events(tmp_path / "a.es")
+        np.testing.assert_array_equal(cut.events, SCENE[:-1])
+        assert cut.lost_bytes == 3
+
+    @pytest.mark.parametrize(
+        ("change", "match"),
+        [
+            (lambda data: data[:17], "17 of 20 bytes"),
+            (lambda data: data[:12] + b"\x01" + data[13:], r"version 1\.0\.0; only 2"),
+            (lambda data: data[:15] + b"\x00" + data[16:], "holds generic events"),
+            (lambda data: data[:15] + b"\x63" + data[16:], "events of kind 99"),
+            (lambda data: data[:16] + bytes(4) + data[20:], "0 x 0 pixels"),
+        ],
+    )
+    def test_headers_that_cannot_be_used(self, tmp_path, change, match):
+        with pytest.raises(InputError, match=match):
+            read(tmp_path / "a.es", change(scenes.event_stream(SCENE)))
+
+    def test_an_event_outside_the_sensor_is_counted(self, tmp_path):
+        data = scenes.event_stream(SCENE)
+        (tmp_path / "a.es").write_bytes(
+            data[:18] + b"\x17\x00" + data[20:]
+        )  # 23 rows: the upper 25 are not there
+        read = read_events(tmp_path / "a.es")
+        lower = SCENE[SCENE["y"] >= 25]
+        np.testing.assert_array_equal(read.events["y"], lower["y"] - 25)
+        np.testing.assert_array_equal(read.events["t"], lower["t"])
+        assert read.damage == (f"{len(SCENE) - len(lower)} events outside 64x23 left out",)
+
+    def test_faery_reads_and_writes_the_same(self, tmp_path):
+        faery = pytest.importorskip("faery")
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(SCENE))
+        theirs = np.concatenate([*faery.events_stream_from_file(tmp_path / "a.es")])
+        for mine, field in zip("xypt", ("x", "y", "on", "t"), strict=True):
+            np.testing.assert_array_equal(theirs[field], SCENE[mine])
+        faery.events_stream_from_array(theirs, (64, 48)).to_file(tmp_path / "b.es")
+        again = read_events(tmp_path / "b.es").events
+        again["t"] += SCENE["t"][0]  # it writes times from 0
+        np.testing.assert_array_equal(again, SCENE)
+
+
 def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
     data = scenes.aedat3(SCENE)
     for length in range(len(data) - 100, len(data), 7):
@@ -153,6 +245,23 @@ def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
         np.testing.assert_array_equal(cut.events, SCENE[: len(cut.events)])
         assert len(cut.events) > 580
         assert "cut short" in cut.damage[0]
+
+
+def ecf_file(h5py, path, chunks, *, n=None, is_shuffled=False):
+    """A file of Metavision: a table whose chunks of 250 events are stored as they are given."""
+    with h5py.File(path, "w") as root:
+        filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        filters.set_chunk((250,))
+        if is_shuffled:
+            filters.set_shuffle()
+        filters.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
+        space = h5py.h5s.create_simple((n or 250 * len(chunks),))
+        kind = h5py.h5t.py_create(SCENE.dtype)
+        table = h5py.h5d.create(root.create_group("CD").id, b"events", kind, space, filters)
+        for i, chunk in enumerate(chunks):
+            table.write_direct_chunk((250 * i,), chunk)
+        root.attrs["geometry"] = "64x48"
+    return path
 
 
 class TestHdf5:
@@ -187,6 +296,33 @@ class TestHdf5:
         for name in ("e2vid.h5", "v2e.h5", "mvsec.h5"):
             np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
         assert "davis/right/events" in open_events(tmp_path / "mvsec.h5").assumptions[0]
+
+    @pytest.mark.parametrize("mode", [0, 1, 2])
+    def test_ecf_of_prophesee_in_every_packing(self, tmp_path, h5py, mode):
+        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)])
+        file = open_events(path)
+        np.testing.assert_array_equal(np.concatenate([*file]), SCENE[:500])
+        assert (file.declared, file.damage, len([*file])) == ((48, 64), [], 2)
+
+    def test_the_last_chunk_of_ecf_holds_more_than_the_table(self, tmp_path, h5py):
+        padded = np.concatenate([SCENE[250:400], np.zeros(100, SCENE.dtype)])  # as the HDF5 library writes it
+        chunks = [scenes.ecf(SCENE[:250], 2), scenes.ecf(padded, 2)]
+        path = ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
+        np.testing.assert_array_equal(read_events(path).events, SCENE[:400])
+
+    @pytest.mark.parametrize("cut", [4, 11, 12, 300, 700])
+    def test_ecf_that_is_cut_short_keeps_the_chunks_before(self, tmp_path, h5py, cut):
+        chunks = [scenes.ecf(SCENE[:250], 1), scenes.ecf(SCENE[250:500], 1)[:cut]]
+        cut_short = read_events(ecf_file(h5py, tmp_path / "a.h5", chunks))
+        np.testing.assert_array_equal(cut_short.events, SCENE[:250])
+        assert "after event 250 is lost: a chunk of ECF" in cut_short.damage[0]
+        with pytest.raises(InputError, match="damaged: a chunk of ECF"):
+            open_events(ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
+
+    def test_ecf_together_with_another_filter_is_refused(self, tmp_path, h5py):
+        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
+        with pytest.raises(InputError, match="with this filter alone"):
+            open_events(path)
 
     def test_half_of_the_tables(self, tmp_path, h5py):
         with h5py.File(tmp_path / "a.h5", "w") as root:

@@ -38,12 +38,14 @@ def test_a_sound_installation(requirements):
     assert set(doctor.EXTRAS) >= set(found["extras"])
     assert found["threads"]["layer"] in {"tbb", "omp", "workqueue"}
     assert set(found["vectors"]) <= set(found["cpu_features"])
+    assert found["kernels"]["digest"] in found["kernels"]["folder"]
     assert found["speed"]["events_per_s"] > 0
     assert found["speed"]["event_us"] > 0
     table = run()
     assert table.exit_code == 0
     assert "all is well" in table.stdout
     assert found["machine"]["python"] in table.stdout
+    assert found["kernels"]["digest"] in table.stdout
 
 
 def test_a_missing_extra_is_no_problem(requirements):
@@ -74,7 +76,7 @@ def test_a_missing_or_outdated_requirement_is_a_problem(requirements, line, says
 
 def test_kernels_that_cannot_be_kept_are_a_problem(requirements, monkeypatch):
     requirements("numpy>=2")
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(doctor.cache, "folder", lambda: None)
     result = run("--json")
     assert result.exit_code == 1
     assert "set NUMBA_CACHE_DIR" in json.loads(result.stdout)["problems"][0]

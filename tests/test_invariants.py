@@ -131,6 +131,14 @@ def test_features_are_those_of_the_window_however_it_is_fed_and_read(kind, data)
     assert_every_way_agrees(case, events, data.draw(st.integers(-5000, 5000)), data.draw(st.integers(0, 99)))
 
 
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_features_are_those_of_the_window_on_streams_that_cross_many_bins(kind):
+    for seed in range(4):
+        case = known_case(kind)
+        events = random_events(np.random.default_rng(seed), case.geometry, case.resolution, 120)
+        assert_every_way_agrees(case, events, 0, seed)
+
+
 @pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)
 def test_features_of_independent_atoms_agree_within_the_bound_of_the_gap(kind):
     for seed in range(4):

@@ -253,6 +253,7 @@ def test_events_alone_fill_the_page_and_can_be_steered(tab, tmp_path):
     try:
         until(lambda: any("waiting" in line for line in lines))
         tab.open(next(line.partition(": ")[2] for line in lines if line.startswith("page")))
+        tab.until("typeof model !== 'undefined'")
         player = f"({LAST}).player"
         tab.until(f"({player})?.ended && ({LAST}).timeline?.done")
         assert tab.value("getComputedStyle(document.querySelector('.features')).display") == "none"

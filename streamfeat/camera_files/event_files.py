@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from streamfeat.camera_files.aedat import open_aedat2, open_aedat3
+from streamfeat.camera_files.aedat import open_aedat1, open_aedat2, open_aedat3
 from streamfeat.camera_files.aedat4 import open_aedat4
 from streamfeat.camera_files.arrays import open_numpy
 from streamfeat.camera_files.containers import open_hdf5
+from streamfeat.camera_files.event_stream import open_event_stream
 from streamfeat.camera_files.prophesee import (
     encoding_of_header,
     open_bin40,
@@ -45,9 +46,11 @@ FORMATS = {
     "evt21": "Prophesee EVT 2.1 .raw",
     "evt3": "Prophesee EVT 3.0 .raw",
     "evt4": "Prophesee EVT 4.0 .raw",
-    "aedat2": "AEDAT 2.0 .aedat",
+    "aedat1": "AEDAT 1.0 .aedat (DVS128)",
+    "aedat2": "AEDAT 2.0 .aedat (DVS128, DAVIS)",
     "aedat3": "AEDAT 3.1 .aedat",
     "aedat4": "AEDAT 4 .aedat4",
+    "es": "Event Stream 2 .es (DVS, ATIS)",
     "hdf5": "HDF5 .h5/.hdf5 (Prophesee, DSEC, M3ED, MVSEC, e2vid, v2e)",
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
     "text": "text .txt/.csv (t x y p)",
@@ -55,7 +58,7 @@ FORMATS = {
 """What can be read, by the name that `open_events` takes."""
 
 EXTENSIONS = frozenset(
-    [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
+    [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".es", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
 )
 """Endings, lower case, of files in which events are looked for."""
 
@@ -239,14 +242,18 @@ def _find_format(path: Path, head: bytes) -> str:
             return "dat"
     if ending == ".bin":
         return "bin40"
+    if ending == ".aedat" and not head.startswith(b"#!AER-DAT"):
+        return "aedat1"
     raise InputError(f"{path}: not a known event file; known are {'; '.join(FORMATS.values())}")
 
 
 _MAGIC = {
+    b"#!AER-DAT1": "aedat1",
     b"#!AER-DAT2": "aedat2",
     b"#!AER-DAT3": "aedat3",
     b"#!AER-DAT4": "aedat4",
     b"\x89HDF\r\n\x1a\n": "hdf5",
+    b"Event Stream": "es",
 }
 
 _OPENERS: dict[str, _Open] = {
@@ -256,9 +263,11 @@ _OPENERS: dict[str, _Open] = {
     "evt21": open_evt21,
     "evt3": open_evt3,
     "evt4": open_evt4,
+    "aedat1": open_aedat1,
     "aedat2": open_aedat2,
     "aedat3": open_aedat3,
     "aedat4": open_aedat4,
+    "es": open_event_stream,
     "hdf5": open_hdf5,
     "numpy": open_numpy,
     "text": open_text,

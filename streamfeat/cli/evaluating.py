@@ -48,9 +48,22 @@ def evaluate(
     context: typer.Context,
     recordings: RecordingsArgument,
     methods: Annotated[
-        list[str],
-        typer.Option("--method", help="direct, inverse, kmeans, random, hats, hots, counts; repeat it."),
-    ] = ["direct", "inverse"],  # noqa: B006  (Typer's way; it is never changed)
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            show_default="direct and inverse; model with -m",
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            "-m",
+            help="What --method model takes: a model, whose filters are not learned anew.",
+            show_default="the general one",
+        ),
+    ] = None,
     sweeps: Annotated[
         list[str] | None,
         typer.Option(
@@ -123,7 +136,10 @@ def evaluate(
             refuse_existing(path, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel}
+    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel, "model": str(model or "")}
+    methods = methods or (["model"] if model else ["direct", "inverse"])
+    if model and "model" not in methods:
+        raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:

@@ -4,12 +4,10 @@ Lives here: versions against what the package asks for, extras, threads, kernels
 Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
 """
 
-import os
 import re
 import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, requires, version
-from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -20,7 +18,7 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.events import Events
-from streamfeat.kernels.ingest import count_events
+from streamfeat.kernels import cache
 from streamfeat.report.machine import Disturbance, describe_machine
 from streamfeat.simulate.saccades import CameraModel, digit_samples
 
@@ -87,8 +85,8 @@ def examine(progress: Callable[[str], None] = lambda step: None, *, seconds: flo
     report |= _work(progress, seconds)
     if not report["kernels"]["cached"]:
         problems.append(
-            f"compiled kernels cannot be kept in {report['kernels']['folder']}, so every start compiles them "
-            "again: set NUMBA_CACHE_DIR to a folder that can be written to"
+            "compiled kernels cannot be kept anywhere, so every start compiles them again: set "
+            "NUMBA_CACHE_DIR to a folder that can be written to"
         )
     if not report["exact"]:
         problems.append(
@@ -172,9 +170,8 @@ def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:
 
 
 def _kernel_cache() -> dict[str, Any]:
-    folder = Path(count_events.stats.cache_path or "")
-    kept = bool(count_events.stats.cache_path) and os.access(folder, os.W_OK)
-    return {"folder": str(folder), "cached": kept}
+    folder = cache.folder()
+    return {"folder": str(folder or ""), "cached": folder is not None, "digest": cache.digest()}
 
 
 def _events_per_second(take: Callable[[Events], None], events: Events, seconds: float, *, size: int) -> float:

@@ -27,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     print_losses,
     print_result,
     progress_bars,
@@ -185,8 +186,8 @@ def _keeper(path: Path) -> "Keep":
 def train(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
-    model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
+    model: ModelOption = None,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
@@ -213,7 +214,7 @@ def train(
     kind = groups_named(groups)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
-    encoder = Encoder.load(model)
+    encoder = Encoder.load(model_or_general(model))
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:

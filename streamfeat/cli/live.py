@@ -26,6 +26,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     out,
     print_losses,
     print_result,
@@ -82,8 +83,8 @@ def names_of(key: str | None, ros2: str | None, domain: int) -> "Names":
     "-c recordings/digits_classifier.safetensors"
 )
 def listen(
-    model: ModelOption,
     key: KeyArgument = None,
+    model: ModelOption = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
@@ -152,6 +153,7 @@ def listen(
         if path and str(path) != "-":
             refuse_existing(path, overwrite=overwrite)
     names = names_of(key, ros2, domain)
+    chosen = model_or_general(model)
     common: dict[str, Any] = {
         "emit": emit,
         "learn_online": learn_online,
@@ -166,11 +168,11 @@ def listen(
                 "on a cluster cameras need no --shard and no --announced, and features and predictions go to "
                 "the network: leave out --output, --json-lines, --table and --metrics, or use `record`"
             )
-        _spread(names, model, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
+        _spread(names, chosen, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
     share = Shard.parse(shard) if shard is not None else None
     job = ListenJob(
-        names, model, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
+        names, chosen, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
     )
     to_terminal = str(json_lines) == "-"
     job.run(

@@ -26,6 +26,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     out,
     progress_bars,
     refuse_existing,
@@ -50,8 +51,14 @@ def latency(
     recording: RecordingArgument,
     reading: "ReadOptions",
     models: Annotated[
-        list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
-    ],
+        list[Path] | None,
+        typer.Option(
+            "--model",
+            "-m",
+            help="Model, from `streamfeat learn`; may be repeated.",
+            show_default="the general one",
+        ),
+    ] = None,
     emit: Annotated[
         list[str],
         typer.Option(
@@ -89,7 +96,7 @@ def latency(
         refuse_existing(plot, overwrite=overwrite)
     report = LatencyReport(
         recording,
-        models,
+        models or [model_or_general(None)],
         emit,
         topic=topic,
         reading=reading,

@@ -152,7 +152,10 @@ SpeedOption = Annotated[
         help="1 is the recorded pace, 2 twice that, or max.", autocompletion=completing("1", "2", "max")
     ),
 ]
-ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]
@@ -273,6 +276,19 @@ def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterato
         if not quiet:
             err.print(f"[dim]{found.description}[/]", soft_wrap=True)
         yield found
+
+
+def model_or_general(model: Path | None) -> Path:
+    """The model that was given; without one the general model, which is said on standard error."""
+    from streamfeat.shipped.general import GENERAL_MODEL
+
+    if model is None:
+        err.print(
+            "[dim]model:[/] the general one that ships; filters learned from your own recordings fit them "
+            "better: `streamfeat learn`, then -m",
+            soft_wrap=True,
+        )
+    return model or GENERAL_MODEL
 
 
 def print_losses(losses: "Losses") -> None:

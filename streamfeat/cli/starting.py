@@ -114,7 +114,8 @@ def _overview(found: dict[str, Any]) -> dict[str, Any]:
         "vectors": ", ".join(found["vectors"]) or "none",
         "threads": f"{found['threads']['numba']}, layer {found['threads']['layer']}",
         **{name: about["installed"] or "missing" for name, about in found["required"].items()},
-        "kernels": f"{'kept in' if kernels['cached'] else 'cannot be kept in'} {kernels['folder']}",
+        "kernels": f"of sources {kernels['digest']}, "
+        + (f"kept in {kernels['folder']}" if kernels["cached"] else "kept nowhere"),
         "first_use": f"{kernels['first_use_s']} s",
         "exact": "yes: stream and offline features have the same bits" if found["exact"] else "no",
         "feeding": f"{speed['events_per_s']:,} events a second",

@@ -21,6 +21,7 @@ from streamfeat.cli.program import (
     TopicOption,
     VerboseOption,
     app,
+    model_or_general,
     out,
     print_losses,
     print_result,
@@ -42,8 +43,8 @@ __all__ = ["replay"]
 @reads_recordings()
 def replay(
     recording: RecordingArgument,
-    model: ModelOption,
     reading: "ReadOptions",
+    model: ModelOption = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
@@ -80,7 +81,7 @@ def replay(
             refuse_existing(path, overwrite=overwrite)
     job = ReplayJob(
         recording,
-        model,
+        model_or_general(model),
         classifier,
         emit=emit,
         speed=parse_speed(speed),

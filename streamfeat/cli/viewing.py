@@ -19,6 +19,7 @@ from streamfeat.cli.program import (
     TopicOption,
     app,
     err,
+    model_or_general,
     print_result,
     refuse_existing,
 )
@@ -48,6 +49,9 @@ def view(
         Path | None,
         typer.Option("--classifier", "-c", help="Show predictions, too, of this classifier."),
     ] = None,
+    features: Annotated[
+        bool, typer.Option("--features", help="Show features of the general model, where no -m is given.")
+    ] = False,
     emit: EmitOption = "auto",
     web: Annotated[
         bool | None,
@@ -121,7 +125,7 @@ def view(
         options = {"network": Network(zenoh_config, zenoh_port), "console": err}
     job = View(
         recording or names_of(source, ros2, domain),
-        model,
+        model_or_general(model) if model or features or classifier else None,
         classifier,
         emit=emit,
         rate=rate,

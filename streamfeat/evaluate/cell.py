@@ -179,6 +179,7 @@ def _learned(encoder: Encoder) -> dict[str, Any]:
     shown = np.unique(np.linspace(0, encoder.n_filters - 1, _SHOWN_FILTERS).astype(int))
     return {
         "shape": [geometry.n_bins, geometry.patch, geometry.patch],
+        "n_filters": encoder.n_filters,
         "filters": [[round(float(v), 4) for v in encoder.filters[k]] for k in shown],
         **{
             name: encoder.provenance[name]

@@ -18,6 +18,7 @@ METHODS = {
     "inverse": "learned dictionary (inverse formulation)",
     "kmeans": "spherical k-means filters",
     "random": "random filters",
+    "model": "a model that was learned before",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
     "counts": "count images",
@@ -27,7 +28,13 @@ METHODS = {
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
 _TRAINING = ("mirror", "kernel")
-_USED_WITHOUT_FILTERS = {"hats": _TRAINING, "hots": ("seed", *_TRAINING), "counts": _TRAINING}
+_OTHERS_USE = {
+    "model": ("model", *_TRAINING),
+    "hats": _TRAINING,
+    "hots": ("seed", *_TRAINING),
+    "counts": _TRAINING,
+}
+"""What those use that learn no filters here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,10 +42,12 @@ class Trial(Setting):
     """What a run can be told: all that `learn` can, and how the classifier is trained.
 
     Attributes:
+        model: path of the model that the method `model` takes; the general model that ships if empty.
         mirror: train on mirror images of the training samples as well.
         kernel: `linear`, or `rbf`.
     """
 
+    model: str = ""
     mirror: bool = False
     kernel: str = "linear"
 
@@ -57,9 +66,9 @@ SWEPT = tuple(name for name in _DEFAULTS if name != "formulation")
 
 def used_by(method: str) -> tuple[str, ...]:
     """Names of the values of a setting that mean something to a method."""
-    if method in _USED_WITHOUT_FILTERS:
-        return _USED_WITHOUT_FILTERS[method]
-    return tuple(name for name in SWEPT if name not in _NOT_USED.get(method, ()))
+    if method in _OTHERS_USE:
+        return _OTHERS_USE[method]
+    return tuple(name for name in SWEPT if name not in {"model", *_NOT_USED.get(method, ())})
 
 
 @dataclass(frozen=True, slots=True)

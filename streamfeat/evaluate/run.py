@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.cell import run_cells
 from streamfeat.evaluate.leakage import check_leakage
-from streamfeat.evaluate.methods import Report
+from streamfeat.evaluate.methods import Report, model_path
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
 from streamfeat.evaluate.scores import (
@@ -33,7 +34,7 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
-_VERSION = 3
+_VERSION = 4
 
 _UNITS_IN_WORDS = {
     "block": "runs of neighbouring samples, 25 of each class",
@@ -158,6 +159,7 @@ def evaluate(
         "scored": data.scored,
         "groups": data.groups,
         "early_samples": early_samples,
+        "models": _models(cells),
     }
     kept = StateFile(state, header)
     leakage = check_leakage(data, report, workers)
@@ -191,6 +193,12 @@ def evaluate(
         "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
         "machine": describe_machine(),
     }
+
+
+def _models(cells: Sequence[Cell]) -> dict[str, str]:
+    """The models that cells take, and a digest of each: a state of other files is of another run."""
+    paths = {model_path(cell.setting) for cell in cells if cell.method == "model"}
+    return {str(path): Encoder.load(path).fingerprint for path in sorted(paths)}
 
 
 def save_result(path: Path, result: dict[str, Any]) -> None:

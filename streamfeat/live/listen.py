@@ -58,7 +58,7 @@ class ListenJob:
 
     Args:
         names: of the topics.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of one to predict with, or the classifier; features alone without it.
         emit: when to emit, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
@@ -87,7 +87,7 @@ class ListenJob:
     def __init__(
         self,
         names: Names,
-        model: ModelSource,
+        model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
         emit: str | EmitPolicy = "auto",
@@ -271,7 +271,7 @@ def _recording_sink(path: Path) -> RecordingSink:
 
 def listen(
     topics: str,
-    model: ModelSource,
+    model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
     emit: str | EmitPolicy = "auto",
@@ -298,7 +298,7 @@ def listen(
     Args:
         topics: zenoh key expression, such as `robot/*/events`; or a ROS 2 topic (rmw_zenoh), with its slash
             in front.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
         emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
         ros_domain: ROS_DOMAIN_ID, of a ROS 2 topic.

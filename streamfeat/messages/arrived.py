@@ -1,8 +1,8 @@
-"""A packet between its decoder and its place in time, and those of its events whose times cannot be right.
+"""A packet between its decoder and its place in time.
 
-Lives here: `Arrived`, which knows the span of its times; telling a few events with absurd times from the
-others, by the packet's own times.
-Not here: packets that are absurd as a whole, and what is counted (`timeline`).
+Lives here: `Arrived`, which knows the span of its times, and leaves out events whose times cannot be right.
+Not here: how these are told from the others (`strays`), packets that are absurd as a whole, and what is
+counted (`timeline`).
 """
 
 from dataclasses import dataclass, field
@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.decode import time_span
-from streamfeat.messages.clock import BACK_US, STEP_US
+from streamfeat.messages.codecs import EVT3_WRAP_US
 from streamfeat.messages.packets import MAX_STREAM_US, Label
+from streamfeat.messages.strays import BACK_US, STEP_US, false_wrap, stray_events, tail_apart
 
-__all__ = ["Arrived", "stray_events"]
-
-_FEW = 8
-"""Events apart from the others are strays if they are fewer than one in so many."""
+__all__ = ["Arrived"]
 
 
 @dataclass(slots=True)
@@ -63,6 +61,33 @@ class Arrived:
         self.first_us, self.last_us = span.tolist()
         return n_inside
 
+    def take_wrap_back(self, before_us: int, held: "Arrived | None") -> int:
+        """Undo a wrap that strays more than half the range of evt3 ahead have made; changes the events.
+
+        One packet may be such a stray, or one event in eight of a packet.
+
+        Args:
+            before_us: the time that the packets before reached, as the camera says.
+            held: the packet before, if that is held.
+
+        Returns:
+            The number of wraps that were undone, 0 or 1.
+        """
+        t = self.events["t"]
+        if len(t) == 0:
+            return 0
+        is_behind = held is not None and bool(held.tail or held.first_us > before_us + EVT3_WRAP_US // 2)
+        if held and held.tail:
+            before_us = held.last_us
+        if is_behind and -BACK_US <= int(t[0]) - EVT3_WRAP_US - before_us <= STEP_US:
+            at: int | None = 0
+        else:
+            at = None if held else false_wrap(t, before_us, len(t) // 8)
+        if at is None:
+            return 0
+        t[at:] -= EVT3_WRAP_US
+        return 1
+
     def leave_impossible_out(self) -> tuple[int, int]:
         """Leave out events with times that no message can have; give their number and the time of one."""
         t = self.events["t"]
@@ -86,61 +111,7 @@ class Arrived:
         if n_strays:
             self.events = self.events[~strays]
             t = self.events["t"]
-        self.tail = _tail(t)
+        self.tail = tail_apart(t)
         body = t[: len(t) - self.tail]
         self.first_us, self.last_us = int(body.min()), int(body.max())
         return n_strays, one_us
-
-
-def stray_events(t: NDArray[np.int64], before_us: int | None) -> NDArray[np.bool_]:
-    """Mark the few events of one packet whose times are more than a second apart from the others.
-
-    Args:
-        t: `(n,)` times in stored order, microseconds, n > 0.
-        before_us: the time that the packets before reached, None if there are none.
-
-    Returns:
-        `(n,)`; none is marked where too many would be, for then the clock itself has moved.
-    """
-    strays = np.zeros(len(t), np.bool_)
-    if len(t) < 2:
-        return strays
-    for _ in range(3):
-        kept = np.flatnonzero(~strays)
-        ahead, behind = _apart(t[kept], before_us)
-        fewer = _less_likely(t[kept], ahead, behind)
-        if not fewer.any() or (np.count_nonzero(strays) + np.count_nonzero(fewer)) * _FEW > len(t):
-            break
-        strays[kept[fewer]] = True
-    return strays
-
-
-def _less_likely(
-    t: NDArray[np.int64], ahead: NDArray[np.bool_], behind: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """The set of fewer events; of two equal ones, that which lies further from the middle."""
-    if not (ahead.any() and behind.any()):
-        return ahead | behind
-    counts = np.count_nonzero(ahead), np.count_nonzero(behind)
-    if counts[0] != counts[1]:
-        return ahead if counts[0] < counts[1] else behind
-    far = np.abs(t - np.median(t))
-    return ahead if far[ahead].max() >= far[behind].max() else behind
-
-
-def _apart(t: NDArray[np.int64], before_us: int | None) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Events more than a step ahead of one that follows, and more than a step behind one before."""
-    lowest_after = np.minimum.accumulate(t[::-1])[::-1]
-    highest_before = np.maximum.accumulate(t)
-    if before_us is not None and np.median(t) >= before_us - BACK_US:
-        highest_before = np.maximum(highest_before, before_us + STEP_US - BACK_US)
-    return t > lowest_after + STEP_US, t < highest_before - STEP_US
-
-
-def _tail(t: NDArray[np.int64]) -> int:
-    """How many events at the end of a packet are a step ahead of all others, and few; 0 if there are none."""
-    steps = np.flatnonzero(np.diff(t) > STEP_US)
-    if len(steps) == 0:
-        return 0
-    tail = len(t) - 1 - int(steps[-1])
-    return tail if tail * _FEW <= len(t) else 0

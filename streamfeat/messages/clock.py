@@ -8,19 +8,16 @@ from typing import Any, Literal, NamedTuple
 
 from streamfeat.files.json_fields import Fields
 from streamfeat.messages.packets import MAX_STREAM_US
+from streamfeat.messages.strays import BACK_US, STEP_US
 
-__all__ = ["BACK_US", "STEP_US", "CameraClock", "Placement"]
+__all__ = ["CameraClock", "Placement"]
 
-_WRAPS_US = (1 << 31, 1 << 24)
-"""Periods of camera clocks that are known to wrap: libcaer (36 minutes) and EVT3 (16.8 s)."""
+_WRAPS_US = (1 << 32, 1 << 31, 1 << 24)
+"""Periods of camera clocks that are known to wrap: 32 bits (72 minutes), libcaer (36) and EVT3 (16.8 s)."""
 _NEAR_US = 2_000_000
 """A fall that misses a period by less than this is a wrap."""
 _JUMP_US = 60_000_000
 """More than this ahead, and more than twice the time that passed here, is a jump."""
-BACK_US = 500_000
-"""A fall of less than this is events out of order, of the same clock."""
-STEP_US = 1_000_000
-"""Within a packet, and beyond twice the time that passed between packets, a larger step is suspicious."""
 _LATEST_US = 1 << 52
 """No snapshot holds a later time."""
 

@@ -218,6 +218,14 @@ class PacketReader:
         self._is_broken = False
         self._before = stamp_ns, int(events["t"][-1])
 
+    def count_wraps(self, n: int) -> None:
+        """The times of evt3 have wrapped so often more than was counted, in this packet and from now on."""
+        decoder = self._decoders.get("evt3")
+        if n and isinstance(decoder, Evt3Decoder):
+            decoder.count_wraps(n)
+            if self._before:
+                self._before = self._before[0], self._before[1] + n * EVT3_WRAP_US
+
     def resync(self) -> None:
         """Messages are missing: what came before says nothing about what follows."""
         self._is_broken = True

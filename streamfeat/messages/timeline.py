@@ -19,11 +19,12 @@ from streamfeat.errors import InputError
 from streamfeat.files.json_fields import Fields
 from streamfeat.messages.arrived import Arrived
 from streamfeat.messages.cdr import EventPacket
-from streamfeat.messages.clock import BACK_US, STEP_US, CameraClock
+from streamfeat.messages.clock import CameraClock
 from streamfeat.messages.codecs import MAX_PACKET_EVENTS
 from streamfeat.messages.delivery import Delivery, Verdict, fingerprint_of
 from streamfeat.messages.event_messages import parse_events
 from streamfeat.messages.packets import MAX_STREAM_US, Content, Label, Packet, PacketReader
+from streamfeat.messages.strays import BACK_US, STEP_US
 
 __all__ = ["HOLD_NS", "TIMELINE_COUNTS", "Timeline"]
 
@@ -257,6 +258,9 @@ class Timeline:
         done: list[Packet | Label] = []
         if self._held and arrived.now_ns - self._held.now_ns > HOLD_NS:
             done += self._settled(None)
+        if is_message and self._reader.encoding == "evt3" and self.reached_us is not None:
+            placed_us = self.reached_us - self._clock.offset_us
+            self._reader.count_wraps(-arrived.take_wrap_back(placed_us, self._held))
         n_inside = arrived.measure(self._span)
         if is_message and n_inside and (arrived.first_us < 0 or arrived.last_us > MAX_STREAM_US):
             self._within_limits(arrived)

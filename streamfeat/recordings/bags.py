@@ -179,7 +179,8 @@ class FilesSource:
         while waiting or heap:
             while waiting and (not heap or waiting[0][0] <= heap[0][0]):
                 start, i = waiting.pop(0)
-                _push(heap, start, i, self._sources[i].read(topic, WHOLE, losses))
+                source = self._sources[i]
+                _push(heap, start, i, source.read(topic, WHOLE, losses.of(source.path.name)))
             if heap:
                 time, i, item, rest = heapq.heappop(heap)
                 yield item

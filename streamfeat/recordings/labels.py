@@ -12,6 +12,7 @@ stream time, all others are seconds after the first event; which of the two is s
 
 import csv
 import io
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -175,6 +176,8 @@ def with_labels(
     """Put labels into a stream, in place of its own: each before the first event at or after its start.
 
     A packet in which a label begins is cut there. Events that come later but are earlier stay behind it.
+    Where the camera's clock starts anew, seconds after the first event go on by log time, and stream times
+    mean the first run of the clock that reaches them.
 
     Args:
         placed: items of a recording, each with its byte.
@@ -183,10 +186,10 @@ def with_labels(
     Raises:
         InputError: at the end, if no label has begun: the file is of another recording.
     """
-    waiting = list(reversed(table.labels))
-    first_us: int | None = None
-    last_us, begun = 0, 0
-    shift_us = 0
+    begun = [False] * len(table.labels)
+    ends = [label.start_us + label.duration_us for label in table.labels]
+    span: tuple[int, int] | None = None
+    epoch = log_time_ns = shift_us = first_us = at_label = 0
     for at, item in placed:
         if isinstance(item, Label):
             continue
@@ -194,28 +197,35 @@ def with_labels(
             yield at, item
             continue
         latest = np.maximum.accumulate(item.events["t"])
-        if first_us is None:
-            first_us = int(latest[0])
+        if span is None or item.epoch != epoch:
+            passed_us = 0
+            if span is not None:
+                # A camera sends a packet when its last event has come.
+                between_us = (item.log_time_ns - log_time_ns) // 1000 - int(latest[-1] - latest[0])
+                passed_us = span[1] - first_us + max(between_us, 0)
+            epoch, first_us = item.epoch, int(latest[0]) - passed_us
             shift_us = first_us if table.is_relative else 0
-            while waiting and waiting[-1].start_us + waiting[-1].duration_us + shift_us <= first_us:
-                waiting.pop()  # it ended before anything happened
-        last_us = max(last_us, int(latest[-1]))
+            # What ended before this clock began has nothing to begin with.
+            at_label = bisect_right(ends, int(latest[0]) - shift_us)
+            span = span or (first_us, first_us)
+        span, log_time_ns = (span[0], int(latest[-1])), item.log_time_ns
         done = 0
-        while waiting and waiting[-1].start_us + shift_us <= int(latest[-1]):
-            label = waiting.pop()
-            label = replace(label, start_us=label.start_us + shift_us)
-            cut = max(int(np.searchsorted(latest, label.start_us)), done)
-            if cut > done:
-                yield at, replace(item, events=item.events[done:cut], lost=item.lost if done == 0 else 0)
-            done = cut
-            begun += 1
-            yield at, label
+        while at_label < len(ends) and table.labels[at_label].start_us + shift_us <= int(latest[-1]):
+            label, is_new = table.labels[at_label], not begun[at_label]
+            begun[at_label] = True
+            at_label += 1
+            if is_new:
+                label = replace(label, start_us=label.start_us + shift_us)
+                cut = max(int(np.searchsorted(latest, label.start_us)), done)
+                if cut > done:
+                    yield at, replace(item, events=item.events[done:cut], lost=item.lost if done == 0 else 0)
+                done = cut
+                yield at, label
         if done < len(latest):
-            rest = item if done == 0 else replace(item, events=item.events[done:], lost=0)
-            yield at, rest
-    if not begun:
+            yield at, item if done == 0 else replace(item, events=item.events[done:], lost=0)
+    if not any(begun):
         label = table.labels[0]
-        where = f"{(first_us or 0)} to {last_us} us"
+        where = "{} to {} us".format(*(span or (0, 0)))
         raise InputError(
             f"{table.path}: no label lies within the recording, which goes from {where}; the first is from "
             f"{label.start_us + shift_us} us on. Is it the file of another recording?"

@@ -103,9 +103,9 @@ def _open_file(place: Location, topic: str | None, options: ReadOptions) -> Sour
 class _OfCopy:
     """A source that reads a copy, which goes away with it."""
 
-    def __init__(self, path: Location, source: Source, copies: ExitStack) -> None:
+    def __init__(self, path: Location, copy: Path, source: Source, copies: ExitStack) -> None:
         self.path, self.topics = path, source.topics
-        self.assumptions = assumptions_of(source)
+        self.assumptions = [line.replace(str(copy), str(path)) for line in assumptions_of(source)]
         self._source, self._copies = source, copies
 
     def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, SourceItem]]:
@@ -124,8 +124,15 @@ def _local(place: Location, open_local: Callable[[Path], Source]) -> Source:
     if isinstance(place, Path):
         return open_local(place)
     with ExitStack() as copies:
-        source = open_local(copies.enter_context(fetched(place)))
-        return _OfCopy(place, source, copies.pop_all())
+        return _of_copy(place, copies.enter_context(fetched(place)), open_local, copies)
+
+
+def _of_copy(place: Location, copy: Path, open_copy: Callable[[Path], Source], copies: ExitStack) -> Source:
+    try:
+        source = open_copy(copy)
+    except InputError as error:
+        raise InputError(str(error).replace(str(copy), str(place))) from None
+    return _OfCopy(place, copy, source, copies.pop_all())
 
 
 def _unpacked(place: Location, topic: str | None, options: ReadOptions) -> Source:
@@ -142,11 +149,10 @@ def _unpacked(place: Location, topic: str | None, options: ReadOptions) -> Sourc
                         copy.write(block)
                         if copy.tell() > limit:
                             raise InputError(f"{place}: unpacks to over {_MOST_UNPACKED} times its bytes")
-        except zstandard.ZstdError as error:
-            if not path.stat().st_size:
-                raise InputError(f"{place}: cannot be unpacked: {error}; copy the file again") from None
-            # What came before the damage is read, and counted as cut short.
+        except zstandard.ZstdError:
+            pass  # what came before the damage is read, and counted as cut short
         except OSError as error:
             raise InputError(f"{place}: cannot be unpacked: {error.strerror}; is there room?") from None
-        source = _open_file(path, topic, options)
-        return _OfCopy(place, source, copies.pop_all())
+        if not path.stat().st_size:
+            raise InputError(f"{place}: nothing in it can be unpacked; copy the file again")
+        return _of_copy(place, path, partial(_open_file, topic=topic, options=options), copies)

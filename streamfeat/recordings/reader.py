@@ -295,7 +295,7 @@ class Recording(Shown):
             if isinstance(item, Label):
                 totals.labels.append(item)
             else:
-                totals.add(item.events)
+                totals.add(item)
         return totals
 
     @property
@@ -338,8 +338,8 @@ class Recording(Shown):
 
     @property
     def duration_us(self) -> int:
-        """Time from the earliest to the latest event."""
-        return (self.last_us or 0) - (self.first_us or 0)
+        """Time from the earliest to the latest event; of each run of the camera's clock, in sum."""
+        return self._totals.duration_us
 
     def _first_packet(self) -> Packet:
         for _, item in self._stored_items(WHOLE):

@@ -101,8 +101,11 @@ def open_mcap(place: Location) -> BinaryIO:
     wrong = [at for at, (byte, right) in enumerate(zip(magic, _MAGIC, strict=False)) if byte != right]
     if len(magic) < len(_MAGIC) or len(wrong) > 1 or _VERSION_AT in wrong:
         file.close()
-        what = "is empty" if not magic else "is not an MCAP recording"
-        raise InputError(f"{place}: {what} (byte 0); `streamfeat convert` turns other formats into MCAP")
+        if not magic:
+            raise InputError(f"{place}: is empty (0 bytes); copy the file again")
+        raise InputError(
+            f"{place}: is not an MCAP recording (byte 0); `streamfeat convert` turns other formats into MCAP"
+        )
     return file
 
 

@@ -38,7 +38,7 @@ class ReplayJob:
 
     Args:
         recording: path or URL; or an open recording, which is not closed here.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of one to predict with, or the classifier; without it there are features alone, and
             `learn_online` starts from nothing.
         emit: when to emit, see `EmitPolicy.parse`.
@@ -57,7 +57,7 @@ class ReplayJob:
     def __init__(
         self,
         recording: RecordingPath | Recording,
-        model: ModelSource,
+        model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
         emit: str | EmitPolicy = "auto",
@@ -226,7 +226,7 @@ def checked_speed(speed: float | None) -> float | None:
 
 def replay(
     recording: RecordingPath | Recording,
-    model: ModelSource,
+    model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
     emit: str | EmitPolicy = "auto",
@@ -247,7 +247,7 @@ def replay(
 
     Args:
         recording: path or URL; or an open recording, which stays open and is read in a thread meanwhile.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
         emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
         speed: stream seconds for each second of the clock; None for as fast as the program takes them.

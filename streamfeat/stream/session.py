@@ -99,6 +99,7 @@ class Session:
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
         self._log_time_ns = self._source_ns = 0
+        self._is_label_new = False
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -130,6 +131,7 @@ class Session:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
         self._state = snapshot.state.resumed(self._state.every_us)
+        self._is_label_new = self._state.is_untouched
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -147,6 +149,7 @@ class Session:
         elif isinstance(item, Label):
             yield from self._finish_sample()
             self._state.open_sample(item)
+            self._is_label_new = True
             self._restart()
         else:
             yield from self._process_packet(item)
@@ -162,6 +165,7 @@ class Session:
             if packet.until_us is not None:
                 yield from self._pass_time(packet.until_us)
             return
+        self._is_label_new = False
         engine = self._engine_for(packet.resolution)
         valid = _valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
@@ -198,7 +202,9 @@ class Session:
         if self._state.epoch is None:
             self._state.epoch = epoch
             return
-        yield from self._finish_sample()
+        # A label right before the first packet of a new clock is of that clock.
+        if not self._is_label_new:
+            yield from self._finish_sample()
         self._state.begin_epoch(epoch)
         self._restart()
 

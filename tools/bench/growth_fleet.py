@@ -19,7 +19,6 @@ from streamfeat.live.publisher import MessagePublisher
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.packets import PacketWriter
 from streamfeat.report.machine import Disturbance
-from tools.bench.growth_model import Constants, work_of
 from tools.bench.growth_streams import SLICE_US, Load, Stream
 from tools.bench.material import Material
 from tools.live_bench.processes import cpu_seconds, finish, listener, wait_for_reader
@@ -35,7 +34,7 @@ def measure_fleet(
     load: Load,
     counts: tuple[int, ...],
     seconds: float,
-    constants: Constants,
+    event_ns: float,
     turns: int = 3,
 ) -> dict[str, Any]:
     """Cores that one listener keeps busy with so many cameras.
@@ -47,11 +46,11 @@ def measure_fleet(
         load: one camera.
         counts: of cameras.
         seconds: of each, in each turn.
-        constants: what the engines cost.
+        event_ns: what an event costs an engine, nanoseconds.
         turns: of which medians are taken.
     """
     stream, port = Stream(material, load, 20_000), _free_port()
-    engines = constants.predict(work_of(load, stream)) * load.rate / 1e9
+    engines = event_ns * load.rate / 1e9
     disturbance = Disturbance()
     runs = [[_listening(stream, load, count, seconds, port) for count in counts] for _ in range(turns)]
     rows = [
