@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-from streamfeat.events import Events, make_events
+from streamfeat.events import EVENT_DTYPE, Events, make_events
 
 RESOLUTION = (48, 64)
 
@@ -180,3 +180,20 @@ def ecf(events: Events, mode: int) -> bytes:
         out.extend((start << 5 | mask).to_bytes(2, "little"))
     runs(p, 7, 1)
     return bytes(out)
+
+
+def ecf_file(h5py, path, chunks, *, n=None, is_shuffled=False):
+    """A file of Metavision: a table whose chunks of 250 events are stored as they are given."""
+    with h5py.File(path, "w") as root:
+        filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        filters.set_chunk((250,))
+        if is_shuffled:
+            filters.set_shuffle()
+        filters.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
+        space = h5py.h5s.create_simple((n or 250 * len(chunks),))
+        kind = h5py.h5t.py_create(EVENT_DTYPE)
+        table = h5py.h5d.create(root.create_group("CD").id, b"events", kind, space, filters)
+        for i, chunk in enumerate(chunks):
+            table.write_direct_chunk((250 * i,), chunk)
+        root.attrs["geometry"] = "64x48"
+    return path

@@ -834,33 +834,66 @@ def features_from(codes, encoding, pooling=2):
 
 
 def mark_noise(events, limits, past, level, removed, keep):
-    rise, refractory, support = limits.tolist()
-    for i, (x, y, p, t) in enumerate(events.tolist()):
-        keep[i] = True
-        if not (x < level.shape[1] and y < level.shape[0] and p in (0, 1) and abs(t) < 1 << 62):
-            continue
-        hot_before, kept_before, _ = past[:, y, x].tolist()
-        if rise:
-            past[0, y, x] = t
-            left = max(int(level[y, x]) - max(t - hot_before, 0), 0)
-            level[y, x] = min(left + rise, 2_000_000)
-        if rise and level[y, x] > 1_000_000:
-            reason = 0
-        elif refractory and abs(t - kept_before) < refractory:
-            reason = 1
-        else:
-            reason = None
-            if refractory:
-                past[1, y, x] = t
-            if support:
-                around = past[2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].ravel().tolist()
-                around.remove(past[2, y, x])
-                past[2, y, x] = t
-                if not any(abs(t - other) <= support for other in around):
-                    reason = 2
-        if reason is not None:
-            keep[i] = False
-            removed[reason] += 1
+    """Three filters, one after the other: the first two know one pixel, the third its neighbours."""
+    height, width = level.shape
+    x, y, p, t = (events[name].astype(np.int64) for name in "xypt")
+    left = np.flatnonzero(
+        (x < width) & (y < height) & np.isin(p, (0, 1)) & (t > -(2**62)) & (t < 2**62)
+    ).tolist()
+    places = list(zip(y.tolist(), x.tolist(), strict=True))
+    keep[:] = True
+    for reason, noisy in enumerate((_hot, _too_soon, _alone)):
+        if limits[reason]:
+            noise = noisy(left, places, t.tolist(), int(limits[reason]), past[reason], level)
+            keep[noise] = False
+            removed[reason] += len(noise)
+            left = sorted({*left} - {*noise})
+
+
+def _by_pixel(left, places):
+    found = {}
+    for i in left:
+        found.setdefault(places[i], []).append(i)
+    return found.items()
+
+
+def _hot(left, places, t, rise, latest, level):
+    """A leaky bucket of two seconds for each pixel: full above one."""
+    noise = []
+    for place, events in _by_pixel(left, places):
+        bucket, before = int(level[place]), int(latest[place])
+        for i in events:
+            leaked = min(bucket, max(t[i] - before, 0))
+            bucket, before = min(bucket - leaked + rise, 2_000_000), t[i]
+            noise += [i] * (bucket > 1_000_000)
+        level[place], latest[place] = bucket, before
+    return noise
+
+
+def _too_soon(left, places, t, period, latest, level):
+    """Events less than a period away from the last one of their pixel that was not."""
+    noise = []
+    for place, events in _by_pixel(left, places):
+        passed = [int(latest[place])]
+        for i in events:
+            if -period < t[i] - passed[-1] < period:
+                noise.append(i)
+            else:
+                passed.append(t[i])
+        latest[place] = passed[-1]
+    return noise
+
+
+def _alone(left, places, t, support, latest, level):
+    """Events without a latest event of one of the eight pixels around that is near in time."""
+    noise = []
+    for i in left:
+        row, column = places[i]
+        around = np.pad(latest, 1, constant_values=np.iinfo(np.int64).min)[row : row + 3, column : column + 3]
+        others = np.delete(around.ravel(), 4).tolist()
+        noise += [i] * (min(abs(t[i] - other) for other in others) > support)
+        latest[row, column] = t[i]
+    return noise
 
 
 # streamfeat.kernels.surfaces

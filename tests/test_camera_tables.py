@@ -1,11 +1,15 @@
 """Camera files as people have them: orders, names, units, layouts, streams; each says what was assumed."""
 
+import bz2
+import gzip
+
 import camera_files_scene as scenes
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import streamfeat as sf
 from streamfeat.camera_files.event_files import open_events, read_events
 from streamfeat.camera_files.source import TableOptions
 from streamfeat.errors import InputError
@@ -93,6 +97,48 @@ def test_words_index_columns_and_sizes(tmp_path):
         assert open_events(path).declared == (48, 64)
 
 
+FORMS = {
+    "a.tsv": ("t\tx\ty\tp", "{t}\t{x}\t{y}\t{p}"),
+    "no_ending": ("", "{t} {x} {y} {p}"),
+    "spaces.txt": ("", "  {t:10d}   {x:4d} {y:4d}  {p}   "),
+    "pipe.csv": ("t|x|y|p", "{t}|{x}|{y}|{p}"),
+    "decimal_commas.csv": ("t;x;y;p", "{seconds};{x};{y};{p}"),
+    "decimal_commas_and_tabs.txt": ("", "{seconds}\t{x}\t{y}\t{p}"),
+    "comma_and_space.txt": ("", "{t}, {x}, {y}, {p}"),
+    "trailing_comma.csv": ("", "{t},{x},{y},{p},"),
+    "all_quoted.csv": ('"t","x","y","p"', '"{t}","{x}","{y}","{p}"'),
+    "signed.csv": ("t,x,y,p", "{t},{x},{y},{signed:+d}"),
+    "on_off.txt": ("", "{t} {x} {y} {on}"),
+    "positive.csv": ("t,x,y,p", "{t},{x},{y},{positive}"),
+    "scientific.txt": ("", "{t:.9e} {x:.3e} {y:.3e} {p:.3e}"),
+    "notes.txt": ("# made by hand", "{t} {x} {y} {p} # seen"),
+    "classic_mac.csv": ("t,x,y,p\r", "{t},{x},{y},{p}\r"),
+    "rows_and_columns.csv": ("timestamp,row,col,polarity", "{t},{y},{x},{p}"),
+    "camel.csv": ("timestampUs,xCoord,yCoord,isOn", "{t},{x},{y},{p}"),
+    "prefixes.csv": ("t_ns,pixel_x,pixel_y,event_p", "{t}000,{x},{y},{p}"),
+    "unit_alone.csv": ("x,y,pol,micros", "{x},{y},{p},{t}"),
+    "other_columns.csv": ("id,t,x,y,p,label", "7,{t},{x},{y},{p},car"),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_tables_as_people_write_them(tmp_path, name):
+    header, row = FORMS[name]
+    rows = [header] if header else []
+    for t, x, y, p in zip(*(SCENE[field].tolist() for field in "txyp"), strict=True):
+        words = {"on": "ON" if p else "OFF", "positive": "positive" if p else "negative", "signed": 2 * p - 1}
+        rows.append(row.format(t=t, x=x, y=y, p=p, seconds=f"{t / 1e6:.6f}".replace(".", ","), **words))
+    end = "" if name == "classic_mac.csv" else "\n"
+    np.testing.assert_array_equal(
+        read(tmp_path / name, "".join(f"{row}{end}" for row in rows).encode()), SCENE
+    )
+
+
+def test_seconds_and_their_rest_in_columns_of_their_own_are_refused(tmp_path):
+    with pytest.raises(InputError, match="sec,usec,x,y,p lack one of"):
+        read(tmp_path / "a.csv", b"sec,usec,x,y,p\n1,5,2,3,1\n")
+
+
 def test_two_conventions_of_off_in_one_file_are_refused(tmp_path):
     with pytest.raises(InputError, match="one of them is OFF"):
         read(tmp_path / "a.txt", b"10 1 2 1\n20 1 2 0\n30 1 2 -1\n")
@@ -105,6 +151,31 @@ def test_arrays_under_other_names_and_with_labels(tmp_path):
     np.savez(tmp_path / "b.npz", **names)
     for name in ("a.npz", "b.npz"):
         np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
+
+
+@pytest.mark.parametrize(
+    ("make", "ending"),
+    [
+        (lambda: scenes.table(SCENE, "txyp").T, "npy"),
+        (lambda: scenes.table(SCENE, "xytp").astype(">i4"), "npy"),
+        (lambda: scenes.table(SCENE, "txyp").astype("f4"), "npy"),
+        (lambda: SCENE.astype([("x", ">u2"), ("y", ">u2"), ("p", "?"), ("t", ">i8")])[:, None], "npy"),
+        (lambda: {"arr_0": SCENE.astype([("x", "u1"), ("y", "u1"), ("p", "i1"), ("t", "<u4")])}, "npz"),
+        (lambda: {**columns(), "t": SCENE["t"].astype("datetime64[us]")}, "npz"),
+        (lambda: {**columns(), "t": SCENE["t"].astype("timedelta64[us]").astype("m8[ns]")}, "npz"),
+        (lambda: {"t": SCENE["t"], "p": SCENE["p"], "xy": np.stack([SCENE["x"], SCENE["y"]], 1)}, "npz"),
+        (lambda: {f"{name}s": column[:, None] for name, column in columns().items()}, "npz"),
+        (lambda: {**columns(), "about": np.array({"a": 1}, dtype=object)}, "npz"),
+    ],
+)
+def test_arrays_as_people_keep_them(tmp_path, make, ending):
+    made = make()
+    np.savez(tmp_path / "a.npz", **made) if ending == "npz" else np.save(tmp_path / "a.npy", made)
+    np.testing.assert_array_equal(read_events(tmp_path / f"a.{ending}").events, SCENE)
+
+
+def columns():
+    return {name: SCENE[name] for name in "xypt"}
 
 
 def test_a_small_file_that_unpacks_to_much_is_refused(tmp_path):
@@ -247,23 +318,6 @@ def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
         assert "cut short" in cut.damage[0]
 
 
-def ecf_file(h5py, path, chunks, *, n=None, is_shuffled=False):
-    """A file of Metavision: a table whose chunks of 250 events are stored as they are given."""
-    with h5py.File(path, "w") as root:
-        filters = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        filters.set_chunk((250,))
-        if is_shuffled:
-            filters.set_shuffle()
-        filters.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL)
-        space = h5py.h5s.create_simple((n or 250 * len(chunks),))
-        kind = h5py.h5t.py_create(SCENE.dtype)
-        table = h5py.h5d.create(root.create_group("CD").id, b"events", kind, space, filters)
-        for i, chunk in enumerate(chunks):
-            table.write_direct_chunk((250 * i,), chunk)
-        root.attrs["geometry"] = "64x48"
-    return path
-
-
 class TestHdf5:
     @pytest.fixture
     def h5py(self):
@@ -297,9 +351,25 @@ class TestHdf5:
             np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
         assert "davis/right/events" in open_events(tmp_path / "mvsec.h5").assumptions[0]
 
+    @pytest.mark.parametrize("layout", ["rvt", "m3ed", "columns", "big endian"])
+    def test_other_layouts(self, tmp_path, h5py, layout):
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            if layout == "m3ed":
+                root["prophesee/left/calib/resolution"], root["prophesee/left/ms_map_idx"] = [64, 48], [0, 20]
+            elif layout == "rvt":
+                root["events/ms_to_idx"], root["events/t_offset"] = np.arange(31) * 20, 0
+            folder = "prophesee/left" if layout == "m3ed" else "events"
+            for name, column in columns().items():
+                column = column.astype("?") if name == "p" else column
+                column = column.astype(">i8") if layout == "big endian" else column
+                root[f"{folder}/{name}"] = column[:, None] if layout == "columns" else column
+        np.testing.assert_array_equal(read_events(tmp_path / "a.h5").events, SCENE)
+
     @pytest.mark.parametrize("mode", [0, 1, 2])
     def test_ecf_of_prophesee_in_every_packing(self, tmp_path, h5py, mode):
-        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)])
+        path = scenes.ecf_file(
+            h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)]
+        )
         file = open_events(path)
         np.testing.assert_array_equal(np.concatenate([*file]), SCENE[:500])
         assert (file.declared, file.damage, len([*file])) == ((48, 64), [], 2)
@@ -307,20 +377,20 @@ class TestHdf5:
     def test_the_last_chunk_of_ecf_holds_more_than_the_table(self, tmp_path, h5py):
         padded = np.concatenate([SCENE[250:400], np.zeros(100, SCENE.dtype)])  # as the HDF5 library writes it
         chunks = [scenes.ecf(SCENE[:250], 2), scenes.ecf(padded, 2)]
-        path = ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
         np.testing.assert_array_equal(read_events(path).events, SCENE[:400])
 
     @pytest.mark.parametrize("cut", [4, 11, 12, 300, 700])
     def test_ecf_that_is_cut_short_keeps_the_chunks_before(self, tmp_path, h5py, cut):
         chunks = [scenes.ecf(SCENE[:250], 1), scenes.ecf(SCENE[250:500], 1)[:cut]]
-        cut_short = read_events(ecf_file(h5py, tmp_path / "a.h5", chunks))
+        cut_short = read_events(scenes.ecf_file(h5py, tmp_path / "a.h5", chunks))
         np.testing.assert_array_equal(cut_short.events, SCENE[:250])
         assert "after event 250 is lost: a chunk of ECF" in cut_short.damage[0]
         with pytest.raises(InputError, match="damaged: a chunk of ECF"):
-            open_events(ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
+            open_events(scenes.ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
 
     def test_ecf_together_with_another_filter_is_refused(self, tmp_path, h5py):
-        path = ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
         with pytest.raises(InputError, match="with this filter alone"):
             open_events(path)
 
@@ -338,3 +408,23 @@ class TestHdf5:
             open_events(tmp_path / "a.h5")
         file = open_events(tmp_path / "a.h5", options=TableOptions(stream="two/events"))
         np.testing.assert_array_equal(np.concatenate([*file]), SCENE)
+
+
+@pytest.mark.parametrize(("ending", "pack"), [("gz", gzip.compress), ("bz2", bz2.compress)])
+def test_packed_files_are_unpacked_for_the_while_and_damage_is_counted(tmp_path, ending, pack):
+    packed = pack(scenes.text(SCENE, "txyp", ",", "t,x,y,p\n"))
+    path = tmp_path / f"a.csv.{ending}"
+    path.write_bytes(packed)
+    with sf.open_recording(path) as recording:
+        np.testing.assert_array_equal(np.concatenate([*recording]), SCENE)
+        assert not recording.losses
+        assert all(str(path) in line for line in recording.assumptions)
+    if ending == "gz":
+        path.write_bytes(packed[:-300])
+        with sf.open_recording(path) as recording:
+            events = np.concatenate([*recording])
+            np.testing.assert_array_equal(events, SCENE[: len(events)])
+            assert "cannot be unpacked after its byte" in recording.losses.first["damaged file"]
+    path.write_bytes(packed[:3])
+    with pytest.raises(InputError, match="nothing in it can be unpacked"):
+        sf.open_recording(path)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -489,30 +490,35 @@ CELL = Cell("direct", Trial(), 0)
 RESULT = {"hits": "11100", "samples": [4, 5], "confusion": [[1]]}
 
 
+def keep(path):
+    with closing(StateFile(path, HEADER)) as state:
+        state.add(CELL, RESULT)
+
+
 def test_a_cell_is_kept_and_found_again(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER).add(CELL, RESULT)
-    again = StateFile(path, HEADER)
-    assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
-    assert again.get(replace(CELL, fold=1)) is None
-    assert again.get(replace(CELL, setting=Trial(bins=4))) is None
+    keep(path)
+    with closing(StateFile(path, HEADER)) as again:
+        assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
+        assert again.get(replace(CELL, fold=1)) is None
+        assert again.get(replace(CELL, setting=Trial(bins=4))) is None
 
 
 def test_a_line_that_was_being_written_is_dropped(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER).add(CELL, RESULT)
+    keep(path)
     whole = path.read_bytes()
     for cut in range(1, len(whole), 41):
         path.write_bytes(whole[:cut])
-        state = StateFile(path, HEADER)
-        assert len(state) == 0
-        state.add(CELL, RESULT)
+        with closing(StateFile(path, HEADER)) as state:
+            assert len(state) == 0
+            state.add(CELL, RESULT)
         assert path.read_bytes() == whole
 
 
 def test_the_state_of_another_run_is_refused(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER)
+    StateFile(path, HEADER).close()
     with pytest.raises(InputError, match="of a run with other recordings"):
         StateFile(path, {**HEADER, "version": 2})
     path.write_bytes(json.dumps(HEADER).encode() + b'\n{"cell": 1}\n')

@@ -264,7 +264,7 @@ def test_interrupted_recording_is_kept_on_request_and_readable(tmp_path):
 
 
 def test_nowhere_to_write(tmp_path):
-    with pytest.raises(InputError, match="cannot be written: No such file or directory"):
+    with pytest.raises(InputError, match="cannot write there: No such file or directory"):
         RecordingWriter(tmp_path / "absent" / "a.mcap")
 
 

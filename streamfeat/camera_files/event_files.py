@@ -5,6 +5,7 @@ Not here: the formats themselves (`prophesee`, `aedat`, `text`, ...), folders an
 (`streamfeat.convert.datasets`), and MCAP (`streamfeat.recordings.reader`).
 """
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,12 +54,26 @@ FORMATS = {
     "es": "Event Stream 2 .es (DVS, ATIS)",
     "hdf5": "HDF5 .h5/.hdf5 (Prophesee, DSEC, M3ED, MVSEC, e2vid, v2e)",
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
-    "text": "text .txt/.csv (t x y p)",
+    "text": "text .txt/.csv/.tsv (t x y p)",
 }
 """What can be read, by the name that `open_events` takes."""
 
 EXTENSIONS = frozenset(
-    [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".es", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
+    [
+        ".dat",
+        ".bin",
+        ".raw",
+        ".aedat",
+        ".aedat4",
+        ".es",
+        ".h5",
+        ".hdf5",
+        ".npz",
+        ".npy",
+        ".txt",
+        ".csv",
+        ".tsv",
+    ]
 )
 """Endings, lower case, of files in which events are looked for."""
 
@@ -230,7 +245,7 @@ def _find_format(path: Path, head: bytes) -> str:
             return name
     if head.startswith(b"\x89MCAP0\r\n"):
         raise InputError(f"{path}: is an MCAP recording already; no conversion is needed")
-    if ending in (".txt", ".csv"):
+    if ending in (".txt", ".csv", ".tsv"):
         return "text"
     if head.startswith((b"\x93NUMPY", b"PK\x03\x04")) and ending in (".npy", ".npz"):
         return "numpy"
@@ -244,8 +259,13 @@ def _find_format(path: Path, head: bytes) -> str:
         return "bin40"
     if ending == ".aedat" and not head.startswith(b"#!AER-DAT"):
         return "aedat1"
+    if _TEXT.fullmatch(head[:1000]):
+        return "text"
     raise InputError(f"{path}: not a known event file; known are {'; '.join(FORMATS.values())}")
 
+
+_TEXT = re.compile(rb"(?:\xef\xbb\xbf)?[\t\n\r -~]*\d[\t\n\r -~]*")
+"""What a file without a known ending begins with, if it is lines of numbers."""
 
 _MAGIC = {
     b"#!AER-DAT1": "aedat1",

@@ -150,7 +150,7 @@ def _tables(h5py: Any, root: Any) -> tuple[_Tables, list[str]]:
             elif isinstance(thing, h5py.Dataset) and thing.ndim == 2 and thing.shape[1] == 4:
                 if "event" in key.lower() or name == key:
                     tables[name] = [thing], None
-            elif isinstance(thing, h5py.Dataset) and thing.ndim == 1:
+            elif isinstance(thing, h5py.Dataset) and (thing.ndim == 1 or thing.shape[1:] == (1,)):
                 field, _ = field_of(key)
                 if field and field not in found:
                     found[field] = (key, thing)

@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -32,7 +32,11 @@ from streamfeat.cli.program import (
     refuse_existing,
     working,
 )
+from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
+
+if TYPE_CHECKING:
+    from streamfeat.recordings.options import ReadOptions
 
 __all__ = ["evaluate"]
 
@@ -44,9 +48,11 @@ _WIDEST_CONFUSION = 12
     epilog="Example: streamfeat evaluate recordings/digits_train.mcap recordings/digits_test.mcap "
     "--patch 8 --method direct --method hats --sweep filters=50,200 -o result.json --report result.html"
 )
+@reads_recordings()
 def evaluate(
     context: typer.Context,
     recordings: RecordingsArgument,
+    reading: "ReadOptions",
     methods: Annotated[
         list[str] | None,
         typer.Option(
@@ -133,7 +139,7 @@ def evaluate(
         raise InputError(f"--early-samples {early_samples} is not possible; give 0 or more")
     for path in (output, page):
         if path:
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
     base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel, "model": str(model or "")}
@@ -148,7 +154,8 @@ def evaluate(
             progress_bars(quiet=quiet, as_lines=verbose) as report,
         ):
             report("reading labels", 0, 0, "")
-            data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups)
+            data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups, reading)
+            print_assumptions(data.assumptions)
             report("reading labels", 1, 1, "")
             result = run(
                 data,

@@ -4,15 +4,16 @@ Lives here: versions against what the package asks for, extras, threads, kernels
 Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
 """
 
-import re
 import time
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 import numpy as np
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
@@ -105,15 +106,14 @@ def _requirements() -> tuple[dict[str, tuple[str, str]], dict[str, dict[str, tup
     """Installed version ("" for none) and wanted range of each dependency; the same for each extra."""
     required: dict[str, tuple[str, str]] = {}
     extras: dict[str, dict[str, tuple[str, str]]] = {}
-    for line in requires("streamfeat") or []:
-        requirement, _, condition = line.partition(";")
-        match = re.match(r"\s*([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*(.*)", requirement)
-        extra = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", condition)
-        if not match:
+    for requirement in map(Requirement, requires("streamfeat") or []):
+        about = _installed(requirement.name), str(requirement.specifier)
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            required[requirement.name] = about
             continue
-        name, wanted = match[1], match[2].strip(" ()")
-        place = extras.setdefault(extra[1], {}) if extra else required
-        place[name] = _installed(name), wanted
+        for extra in metadata("streamfeat").get_all("Provides-Extra") or []:
+            if requirement.marker.evaluate({"extra": extra}):
+                extras.setdefault(extra, {})[requirement.name] = about
     return required, extras
 
 
@@ -125,21 +125,8 @@ def _installed(name: str) -> str:
 
 
 def _satisfies(found: str, wanted: str) -> bool:
-    """Whether a version is inside bounds such as `>=2.0,<3`; only the bounds that we use ourselves."""
-    if not found:
-        return False
-    for bound in filter(None, wanted.split(",")):
-        limit, mine = _numbers(bound), _numbers(found)
-        length = max(len(limit), len(mine))  # 2 is 2.0
-        limit, mine = (numbers + [0] * (length - len(numbers)) for numbers in (limit, mine))
-        if (mine < limit) if bound.strip().startswith(">=") else (mine >= limit):
-            return False
-    return True
-
-
-def _numbers(text: str) -> list[int]:
-    release = re.search(r"\d+(?:\.\d+)*", text)
-    return [int(part) for part in release[0].split(".")] if release else []
+    """Whether an installed version is inside bounds such as `>=2.0,<3`; "" is never."""
+    return bool(found) and SpecifierSet(wanted).contains(found, prereleases=True)
 
 
 def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def learn(
     from streamfeat.learn.settings import Setting
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(model, overwrite=overwrite or model == resume)
+    refuse_existing(model, *recordings, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
@@ -210,7 +210,7 @@ def train(
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(classifier, overwrite=overwrite)
+    refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")

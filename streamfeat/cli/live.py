@@ -151,7 +151,7 @@ def listen(
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, model, classifier, state, overwrite=overwrite)
     names = names_of(key, ros2, domain)
     chosen = model_or_general(model)
     common: dict[str, Any] = {

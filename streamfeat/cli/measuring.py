@@ -93,7 +93,7 @@ def latency(
 
     if plot:
         check_picture(plot)
-        refuse_existing(plot, overwrite=overwrite)
+        refuse_existing(plot, recording, *(models or ()), overwrite=overwrite)
     report = LatencyReport(
         recording,
         models or [model_or_general(None)],

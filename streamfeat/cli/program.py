@@ -29,6 +29,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import is_replaced, refuse_input
 from streamfeat.files.locations import Location, location_of
 
 if TYPE_CHECKING:
@@ -315,11 +316,10 @@ def print_result(result: dict[str, Any], title: str, *, as_json: bool) -> None:
     out.print(table)
 
 
-def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file unless asked to, before any work is done."""
-    if path.exists() and not overwrite:
+def refuse_existing(path: Path, *inputs: object, overwrite: bool) -> None:
+    """Refuse to replace a file unless asked to, and an input in any case, before any work is done."""
+    refuse_input(path, inputs)
+    if is_replaced(path) and path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; give another name or --overwrite")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the name of a file")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")

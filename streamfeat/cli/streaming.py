@@ -78,7 +78,7 @@ def replay(
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, recording, model, classifier, overwrite=overwrite)
     job = ReplayJob(
         recording,
         model_or_general(model),

@@ -106,7 +106,7 @@ def view(
         require("foxglove", extra="view", what="Foxglove and -o" if foxglove else "-o")
     for path in (output, layout):
         if path:
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, source, model, classifier, overwrite=overwrite)
     recording = _recording(source)
     on_page = web if web is not None else not (foxglove or output)
     if not (on_page or foxglove or output):

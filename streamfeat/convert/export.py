@@ -13,6 +13,7 @@ from typing import Any, Literal
 from streamfeat.convert.outputs import open_output
 from streamfeat.convert.selection import Selection
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import refuse_input
 from streamfeat.files.locations import Location, StoreLocation
 from streamfeat.messages.packets import Label
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
@@ -84,6 +85,7 @@ def convert_recording(
     """
     if isinstance(target, StoreLocation):
         raise InputError(f"{target}: output is local; give a file, and copy it to the store")
+    refuse_input(Path(target), [source])
     selection, done = selection or Selection(), Exported()
     formats: dict[str, Any] = {"overwrite": overwrite, "encoding": encoding, "compression": compression}
     with open_recording(source, topic, reading) as recording:

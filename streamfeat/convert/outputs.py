@@ -16,7 +16,8 @@ import numpy as np
 
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.files.atomic import replacing
+from streamfeat.files.atomic import is_replaced, unwritable
+from streamfeat.files.outputs import OutputFile
 from streamfeat.messages.codecs import EVT3_WRAP_US, encode
 from streamfeat.messages.packets import Label
 from streamfeat.recordings.writer import RecordingWriter
@@ -308,15 +309,15 @@ def open_output(
         with RecordingWriter(path, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
             yield McapOutput(writer)
         return
-    if path.exists() and not overwrite:
+    if not overwrite and is_replaced(path) and path.exists():
         raise InputError(f"{path}: exists already; choose another name or allow to overwrite it")
     try:
-        with replacing(path) as temporary, temporary.open("w+b") as file:
-            output = _FOREIGN[kind](path, file)
+        with OutputFile(path) as whole:
+            output = _FOREIGN[kind](path, whole.file)
             try:
                 yield output
                 output.finish()
             finally:
                 output.close()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise unwritable(path, error) from None

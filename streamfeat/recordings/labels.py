@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import isfinite
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -30,14 +31,15 @@ _MOST_BYTES = 64 << 20
 _LATEST_US = 1 << 52
 _LEAST_STREAM_US = 100_000
 _NAMES = {
-    "start": ("start", "begin", "onset", "from", "t_start", "start_time"),
-    "end": ("end", "stop", "offset", "to", "t_end", "end_time"),
+    "start": ("start", "begin", "onset", "from", "t_start", "start_time", "starttime"),
+    "end": ("end", "stop", "offset", "to", "t_end", "end_time", "endtime"),
     "duration": ("duration", "length"),
     "label": ("label", "class", "name", "category", "annotation"),
     "split": ("split", "set", "subset"),
     "source": ("source", "file"),
 }
 _UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0}
+_UNIT_NAMES = {"sec": "s", "seconds": "s", "msec": "ms", "usec": "us"} | {unit: unit for unit in _UNITS_US}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +49,14 @@ class LabelTable:
     Attributes:
         path: of the file.
         labels: with times as they are there, in microseconds.
-        is_relative: whether times count from the first event.
+        clock: what times count: `stream` time; since the `first` event; or since 1970 by the `host`'s clock,
+            which log times are of.
         assumption: what the file does not say; empty if it says all.
     """
 
     path: Path
     labels: tuple[Label, ...]
-    is_relative: bool
+    clock: Literal["stream", "first", "host"]
     assumption: str = ""
 
 
@@ -107,7 +110,9 @@ def read_labels(path: Path) -> LabelTable:
                 f"{path}: lines {n} and {m} overlap: {first.label!r} ends after {second.label!r} begins; "
                 "a moment has one label"
             )
-    return LabelTable(path, tuple(label for label, _ in labels), unit != "us", assumption)
+    return LabelTable(
+        path, tuple(label for label, _ in labels), "stream" if unit == "us" else "first", assumption
+    )
 
 
 def _rows(path: Path, text: str) -> Iterator[list[str]]:
@@ -132,7 +137,7 @@ def _columns(path: Path, names: Sequence[str]) -> tuple[dict[str, int], str]:
     unknown = []
     for at, name in enumerate(n.strip().lower() for n in names):
         plain, _, unit = name.rpartition("_")
-        plain, unit = (plain, unit) if unit in _UNITS_US else (name, "")
+        plain, unit = (plain, _UNIT_NAMES[unit]) if unit in _UNIT_NAMES else (name, "")
         column = next((column for column, others in _NAMES.items() if plain in others), None)
         if column is None or column in found:
             unknown.append(names[at].strip())
@@ -197,6 +202,8 @@ def with_labels(
             yield at, item
             continue
         latest = np.maximum.accumulate(item.events["t"])
+        if table.clock == "host":
+            shift_us = int(latest[-1]) - item.log_time_ns // 1000
         if span is None or item.epoch != epoch:
             passed_us = 0
             if span is not None:
@@ -204,7 +211,7 @@ def with_labels(
                 between_us = (item.log_time_ns - log_time_ns) // 1000 - int(latest[-1] - latest[0])
                 passed_us = span[1] - first_us + max(between_us, 0)
             epoch, first_us = item.epoch, int(latest[0]) - passed_us
-            shift_us = first_us if table.is_relative else 0
+            shift_us = first_us if table.clock == "first" else shift_us
             # What ended before this clock began has nothing to begin with.
             at_label = bisect_right(ends, int(latest[0]) - shift_us)
             span = span or (first_us, first_us)

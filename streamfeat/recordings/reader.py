@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -24,12 +23,20 @@ from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import Label, Packet
 from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.bags import assumptions_of
-from streamfeat.recordings.labels import read_labels, with_labels
+from streamfeat.recordings.label_topic import labels_for
+from streamfeat.recordings.labels import with_labels
 from streamfeat.recordings.opening import RecordingPath, open_source
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
-from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
+from streamfeat.recordings.sources import (
+    WHOLE,
+    Part,
+    SourceItem,
+    StoredMessage,
+    Topic,
+    unpacked_message,
+)
 from streamfeat.recordings.totals import Totals
 from streamfeat.report.shown import Shown
 
@@ -99,15 +106,15 @@ class Recording(Shown):
         options: ReadOptions = AS_IT_IS,
     ) -> None:
         """See `open_recording`."""
-        labels = read_labels(Path(options.labels)) if options.labels is not None else None
         self._source = open_source(path, topic, options)
-        self._given, self._part, self._options, self._labels = path, part, options, labels
+        self._given, self._part, self._options = path, part, options
         self.assumptions = assumptions_of(self._source)
-        if labels and labels.assumption:
-            self.assumptions.append(labels.assumption)
         try:
             self.path, self.topics = self._source.path, self._source.topics
             self.topic = _choose_topic(self.path, self.topics, topic)
+            self._labels = labels_for(self._source, options.labels, self.topic)
+            if self._labels and self._labels.assumption:
+                self.assumptions.append(self._labels.assumption)
             self.encoding = ""
             self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution

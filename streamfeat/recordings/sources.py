@@ -102,13 +102,13 @@ class Source(Protocol):
     topics: list[Topic]
 
     def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, SourceItem]]:
-        """Yield the messages of one event topic and of all topics with labels, in order of log time.
+        """Yield the messages of one topic and of all topics with labels, in order of log time.
 
         Each comes with its byte: a number that never falls, by which `part` is cut. Damage is skipped and
         counted. A second call begins anew.
 
         Args:
-            topic: of the events.
+            topic: of the events, or of texts that label them.
             part: where to begin; items behind its end still come, but what is lost there is not counted.
             losses: changed.
         """

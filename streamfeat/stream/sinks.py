@@ -7,7 +7,7 @@ Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`)
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO, TypeVar
 
@@ -15,6 +15,8 @@ from rich.console import Console
 from rich.text import Text
 
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import unwritable
+from streamfeat.files.outputs import OutputFile
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import Emission
 
@@ -82,21 +84,17 @@ def emission_record(emission: Emission, *, features: bool = False) -> dict[str, 
 
 
 class JsonLinesSink:
-    """One JSON object a line; to a file, which appears when complete, or to an open stream."""
+    """One JSON object a line; to a file (see `OutputFile`) or an open stream."""
 
     def __init__(self, target: Path | TextIO, *, features: bool = False) -> None:
         """Open the target.
 
         Raises:
-            InputError: the file cannot be written.
+            InputError: the file cannot be written, see `OutputFile`.
         """
-        self._path = target if isinstance(target, Path) else None
         self._features = features
-        try:
-            self._part = self._path.with_name(self._path.name + ".part") if self._path else None
-            self._stream = self._part.open("w") if self._part else target
-        except OSError as error:
-            raise InputError(f"{target}: cannot write there: {error.strerror}") from error
+        self._output = OutputFile(target) if isinstance(target, Path) else None
+        self._stream = None if isinstance(target, Path) else target
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Write a line for each emission.
@@ -106,9 +104,13 @@ class JsonLinesSink:
         """
         lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
         with self._explaining():
-            self._stream.writelines(lines)  # type: ignore[union-attr]
-            if self._path is None:
-                self._stream.flush()  # type: ignore[union-attr]
+            if self._stream:
+                self._stream.writelines(lines)
+                self._stream.flush()
+            elif self._output:
+                self._output.file.writelines(line.encode() for line in lines)
+                if self._output.part is None:
+                    self._output.file.flush()
 
     def close(self, *, failed: bool) -> None:
         """Put the file in its place, or remove it.
@@ -116,15 +118,13 @@ class JsonLinesSink:
         Raises:
             InputError: as for `write`; the file is removed then.
         """
-        if self._path is None or self._part is None:
+        if self._output is None:
             return  # each write was flushed
-        try:
-            with suppress(OSError) if failed else self._explaining():
-                self._stream.close()  # type: ignore[union-attr]
-            if not failed:
-                self._part.replace(self._path)
-        finally:
-            self._part.unlink(missing_ok=True)
+        if failed:
+            self._output.abandon()
+            return
+        with self._explaining():
+            self._output.close()
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:
@@ -133,8 +133,7 @@ class JsonLinesSink:
         except BrokenPipeError:
             raise  # the reader has enough, as `head` has, and nothing is wrong
         except OSError as error:
-            where = self._path or "standard output"
-            raise InputError(f"{where}: cannot be written: {error.strerror}; is there room?") from None
+            raise unwritable(self._output.path if self._output else Path("standard output"), error) from None
 
 
 class RecordingSink:

@@ -18,8 +18,9 @@ from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
-from streamfeat.files.atomic import replacing, write_atomically
+from streamfeat.files.atomic import write_atomically
 from streamfeat.files.locations import Location
+from streamfeat.files.outputs import OutputFile
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
@@ -205,8 +206,8 @@ class View:
         if self._recording_out:
             from streamfeat.view.channels import FileBoard
 
-            path = opened.enter_context(replacing(self._recording_out))
-            file = FileBoard(known, path, self._recording_out)
+            output = opened.enter_context(OutputFile(self._recording_out))
+            file = FileBoard(known, output.part or output.path, output.path)
             opened.callback(file.close)
             self._boards.append(file)
         if self._foxglove_port is not None:

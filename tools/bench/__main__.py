@@ -26,7 +26,7 @@ from streamfeat.events import Resolution  # noqa: E402
 from tools.bench import machine, material, tables  # noqa: E402
 from tools.bench.cluster import measure_cluster  # noqa: E402
 from tools.bench.direct import measure_floors, measure_peers  # noqa: E402
-from tools.bench.fleet_plan import PACKET_US, plan  # noqa: E402
+from tools.bench.fleet_plan import plan  # noqa: E402
 from tools.bench.floor import compiler  # noqa: E402
 from tools.bench.growth import event_ns, measure_growth  # noqa: E402
 from tools.bench.growth_streams import Load  # noqa: E402
@@ -190,13 +190,11 @@ def _resolution(text: str) -> Resolution:
 
 
 def _plan(options: argparse.Namespace) -> int:
-    """Machines for so many cameras: an event is timed here, a packet by the part `growth`."""
+    """Machines for so many cameras, by what an event takes here."""
     n, rate, filters = options.plan
     load = Load(options.emit, filters, options.stride, options.resolution, rate=rate)
-    growth = _results_so_far(options.json)["parts"].get("growth", {})
-    packet_us = growth.get("fleet", {}).get("packet_us") or PACKET_US
     ns = event_ns(material.Material(options.recording), load)
-    print(json.dumps(plan(ns, packet_us, load, n, options.cores), indent=1))
+    print(json.dumps(plan(ns, load, n, options.cores), indent=1))
     return 0
 
 

@@ -69,7 +69,7 @@ def sweeps(quick: bool) -> list[Load]:
         found += [replace(base, resolution=r) for r in ((60, 80), (240, 320), (480, 640))]
         found += [replace(base, rate=rate) for rate in (50_000, 800_000)]
         found += [replace(base, cameras=n) for n in (2, 4, 8)]
-    return [Load(emit, filters=100, stride=12) for emit in ("event", "10ms")] if quick else found
+    return [Load(emit) for emit in ("event", "10ms")] if quick else found
 
 
 class Stream:

@@ -357,9 +357,30 @@ MUTANTS = [
     Mutant(
         "half a file takes the place",
         "files/atomic.py",
-        "        yield temporary\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(path)\n    finally:\n",
-        "        yield temporary\n    finally:\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(path)\n",
+        "        yield temporary\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(target)\n    finally:\n",
+        "        yield temporary\n    finally:\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(target)\n",
         "tests/test_atomic.py",
+    ),
+    Mutant(
+        "a second writer waits for no lock",
+        "files/outputs.py",
+        "fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)",
+        "fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)",
+        "tests/test_outputs.py",
+    ),
+    Mutant(
+        "a part that was renamed meanwhile is taken",
+        "files/outputs.py",
+        "if os.path.samestat(os.fstat(file.fileno()), path.stat()):",
+        "if True:",
+        "tests/test_outputs.py",
+    ),
+    Mutant(
+        "the lock goes before the name",
+        "files/outputs.py",
+        "if self.part and fcntl:  # before",
+        "if self.part and not fcntl:  # before",
+        "tests/test_outputs.py",
     ),
     Mutant(
         "sweep takes others' files",

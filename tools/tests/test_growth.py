@@ -52,8 +52,8 @@ def test_a_run_feeds_every_camera_all_events_again_and_again(material, emit):
 
 def test_a_plan_adds_up():
     load = replace(SMALL, emit="10ms", rate=100_000)
-    found = plan(1800.0, 500.0, load, cameras=100, cores=8)
-    cores = 1800e-9 * 100_000 + 100 * 500e-6
+    found = plan(1800.0, load, cameras=100, cores=8)
+    cores = 1800e-9 * 100_000 + 100 * PACKET_US / 1e6
     assert found["cores_per_camera"] == pytest.approx(cores, abs=1e-4)
     assert (found["machines"] - 1) * 8 * 0.5 < 100 * cores <= found["machines"] * 8 * 0.5
     assert found["processes"] == found["machines"] * 8
@@ -61,20 +61,12 @@ def test_a_plan_adds_up():
     assert 100 / found["processes"] < heaviest < 100
     assert found["its_cores"] == pytest.approx(heaviest * cores, abs=1e-3)
     with pytest.raises(InputError, match=r"one camera keeps \d+\.\d+ cores busy"):
-        plan(18_000.0, 500.0, load, cameras=1, cores=8)
+        plan(18_000.0, load, cameras=1, cores=8)
 
 
-def test_a_plan_is_of_this_machine_and_of_the_packets_of_a_run(tmp_path, capsys):
-    figures = tmp_path / "results.json"
-    words = ["--json", str(figures), "--recording", str(RECORDING), "--plan", "10,0.01,20"]
-    found = []
-    for packet_us in (None, 100.0):
-        if packet_us:
-            figures.write_text(json.dumps({"parts": {"growth": {"fleet": {"packet_us": packet_us}}}}))
-        assert program.main([*words, "--resolution", "60x80"]) == 0
-        found.append(json.loads(capsys.readouterr().out))
-        beyond = 100 * (packet_us or PACKET_US) / 1e6
-        assert found[-1]["cores_per_camera"] == pytest.approx(
-            beyond + found[-1]["engine_cores_per_camera"], abs=1e-3
-        )
-    assert found[0]["cameras"] == 10
+def test_a_plan_times_an_event_on_this_machine(capsys):
+    words = ["--recording", str(RECORDING), "--plan", "10,0.01,20", "--resolution", "60x80"]
+    assert program.main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["cameras"] == 10
+    assert found["engine_cores_per_camera"] == pytest.approx(found["event_ns"] * 10_000 / 1e9, abs=1e-3)
