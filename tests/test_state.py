@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tiny
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from live_net import Collector, attachment, compiled, free_port, plain_session, until
 from streams import KINDS, LASSO_KINDS, cases, random_encoder, random_events, streams
@@ -181,6 +181,7 @@ def some_items(rng, n=12):
 @pytest.mark.parametrize("policy", ["event", "7ev", "10ms", "auto"])
 @RANDOM
 @given(seed=st.integers(0, 10_000))
+@example(seed=404)
 def test_sessions_that_are_restored_anywhere_go_on_with_the_same_bits(policy, seed, tmp_path_factory):
     path = tmp_path_factory.mktemp("state") / "state"
     rng = np.random.default_rng(seed)

@@ -99,7 +99,6 @@ class Session:
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
         self._log_time_ns = self._source_ns = 0
-        self._is_label_new = False
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -131,7 +130,6 @@ class Session:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
         self._state = snapshot.state.resumed(self._state.every_us)
-        self._is_label_new = self._state.is_untouched
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -149,7 +147,6 @@ class Session:
         elif isinstance(item, Label):
             yield from self._finish_sample()
             self._state.open_sample(item)
-            self._is_label_new = True
             self._restart()
         else:
             yield from self._process_packet(item)
@@ -165,7 +162,7 @@ class Session:
             if packet.until_us is not None:
                 yield from self._pass_time(packet.until_us)
             return
-        self._is_label_new = False
+        state.touch()
         engine = self._engine_for(packet.resolution)
         valid = _valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
@@ -203,7 +200,7 @@ class Session:
             self._state.epoch = epoch
             return
         # A label right before the first packet of a new clock is of that clock.
-        if not self._is_label_new:
+        if not self._state.is_untouched:
             yield from self._finish_sample()
         self._state.begin_epoch(epoch)
         self._restart()

@@ -122,8 +122,14 @@ class SessionState:
 
     @property
     def is_untouched(self) -> bool:
-        """Whether a sample is open of which no event has come."""
-        return self.sample is not None and self.last_us == self.sample.start_us and not self.unread
+        """Whether a sample is open, and nothing has come or been emitted since."""
+        return self.sample is not None and self.silent_us < self.sample.start_us
+
+    def touch(self) -> None:
+        """Events come, be they of the open sample or not."""
+        if self.sample:
+            # Nothing is emitted before the start of the sample, so that this moves no emission.
+            self.silent_us = max(self.silent_us, self.sample.start_us)
 
     def begin_epoch(self, epoch: int) -> None:
         """Start anew with the camera's clock: an empty window, with nothing known of what came before.
