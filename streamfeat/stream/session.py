@@ -16,8 +16,7 @@ from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
-from streamfeat.events import Events, Resolution
-from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
@@ -164,7 +163,7 @@ class Session:
             return
         state.touch()
         engine = self._engine_for(packet.resolution)
-        valid = _valid(events, packet.resolution)
+        valid = is_valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
         end = len(events)
         if state.sample and state.sample_end_us is not None:
@@ -360,14 +359,6 @@ class Session:
                 self._stats.unknown_labels += 1
         self._state.close_sample()
         yield emission
-
-
-def _valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
-    """Which events an engine will not reject."""
-    height, width = resolution
-    x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
-    valid: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
-    return valid & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:
