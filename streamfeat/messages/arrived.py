@@ -61,6 +61,10 @@ class Arrived:
         self.first_us, self.last_us = span.tolist()
         return n_inside
 
+    def may_have_wrapped(self, before_us: int) -> bool:
+        """Whether a time may be more than half the range of evt3 ahead of the one before, `measure`d."""
+        return self.last_us - min(self.first_us, before_us) > EVT3_WRAP_US // 2
+
     def take_wrap_back(self, before_us: int, held: "Arrived | None") -> int:
         """Undo a wrap that strays more than half the range of evt3 ahead have made; changes the events.
 

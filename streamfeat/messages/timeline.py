@@ -258,10 +258,12 @@ class Timeline:
         done: list[Packet | Label] = []
         if self._held and arrived.now_ns - self._held.now_ns > HOLD_NS:
             done += self._settled(None)
+        n_inside = arrived.measure(self._span)
         if is_message and self._reader.encoding == "evt3" and self.reached_us is not None:
             placed_us = self.reached_us - self._clock.offset_us
-            self._reader.count_wraps(-arrived.take_wrap_back(placed_us, self._held))
-        n_inside = arrived.measure(self._span)
+            if self._held or n_inside < len(arrived.events) or arrived.may_have_wrapped(placed_us):
+                self._reader.count_wraps(-arrived.take_wrap_back(placed_us, self._held))
+                n_inside = arrived.measure(self._span)
         if is_message and n_inside and (arrived.first_us < 0 or arrived.last_us > MAX_STREAM_US):
             self._within_limits(arrived)
             if len(arrived.events) == 0:
@@ -375,7 +377,8 @@ class Timeline:
                 self._count(what, f"{arrived.first_us} us")
                 before_us = before_us if place.event == "wrapped" else None
         offset_us = self._clock.offset_us
-        self._happened["steps back"] += before_us is not None and arrived.first_us + offset_us < before_us
+        if before_us is not None and arrived.first_us + offset_us < before_us:
+            self._happened["steps back"] += 1
         if offset_us:
             arrived.events = arrived.events.copy()
             arrived.events["t"] += np.int64(offset_us)

@@ -56,6 +56,12 @@ def soak(trials: Trials) -> list[Row]:
     return watch.rows(time.monotonic() - began)
 
 
+def resident_bytes() -> int:
+    """Memory that this process holds."""
+    with open("/proc/self/statm") as file:  # noqa: PTH123
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def _encoder(seed: int) -> Encoder:
     rng = np.random.default_rng(seed)
     geometry = Geometry(patch=8, stride=4, n_bins=3, bin_us=33_334, max_count=2)
@@ -175,8 +181,7 @@ class _Watch:
     def _look(self) -> _Held:
         engine = self.session._engine
         assert engine
-        with open("/proc/self/statm") as file:  # noqa: PTH123
-            rss = int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        rss = resident_bytes()
         files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
         state = engine._state
         size = sum(getattr(state, name).nbytes for name in state._fields)
