@@ -40,6 +40,7 @@ from streamfeat.kernels.layout import (
     CLOCK_SLOT,
     CLOCK_TOUCHED,
     CURSOR_CODED,
+    CURSOR_ENTRY,
     CURSOR_PROJECTED,
     LANES,
     MOMENT_SQUARES,
@@ -499,6 +500,22 @@ def make_ecf(rng):
     return np.concatenate([data, np.zeros(ECF_PADDING, np.uint8)]), len(data), np.zeros(n, EVENT_DTYPE)
 
 
+def make_rows(rng):
+    separator = pick(rng, [b",", b";", b" "])
+    numbers = [b"1", b"-20", b"+3", b"0.5", b".25", b"7.", b"123456789012345678", b" 4\t"]
+    bad = [b"", b".", b"-", b"1e5", b"x", b"1234567890123456789", b"0.123456789012345678", b"1 2", b"--1"]
+    rows = []
+    for _ in range(int(rng.integers(0, 6))):
+        kinds = numbers + bad * (rng.random() < 0.15)
+        rows.append(separator.join(pick(rng, kinds) for _ in range(int(rng.integers(3, 6)))))
+        rows += [b"  "] * (rng.random() < 0.2)
+    text = b"\n".join(rows) + b"\n" * (rng.random() < 0.9)
+    wanted = np.array(pick(rng, [[0, 1, 2], [0, 2], [1], [2, 3]]))
+    out = np.zeros((2, len(wanted), int(pick(rng, [3, 9, 9]))), np.int64)
+    code = separator[0] if separator != b" " else 0
+    return np.frombuffer(text, np.uint8).copy(), code, wanted, out[0].copy(), out[1].copy()
+
+
 def make_groups(rng):
     data = rng.integers(0, 256, 140, np.uint8)
     bits = int(pick(rng, [12, 24]))
@@ -778,7 +795,7 @@ def make_read(rng):
 
 
 def engine_with_news(rng):
-    """An engine with events since its last reading, some planes of which are as if they were being filled."""
+    """An engine with events since its last emission, some planes of which are as if being filled."""
     shape, operator, state = parts_of(read_engine(rng, more=40))
     for plane in range(len(state.cursors)):
         if rng.random() < 0.3:
@@ -828,9 +845,23 @@ def make_finish(rng):
     return shape, state
 
 
+def near_the_end(rng, operator, state):
+    """Position, row and column of an entry where the plane ahead ends within a volume, or None."""
+    if len(state.cursors) == 1 or rng.random() < 0.2:
+        return None
+    _, volume, end = state.cursors[1 - int(state.clock[CLOCK_PLANE])].tolist()
+    if end == 0:
+        return None
+    area = operator.patch**2
+    position, inside = divmod(int(pick(rng, [end - 1, end])) % ((len(state.counts) - 1) * area), area)
+    top, left = (index * operator.stride for index in divmod(volume, int(state.volume_columns.max())))
+    return position + 1, top + inside // operator.patch, left + inside % operator.patch
+
+
 def changed_place(rng, operator, state):
     """Position, row and column of an entry whose clipped count is made another one."""
-    position, row, column = (int(rng.integers(0, side)) for side in state.counts.shape)
+    anywhere = tuple(int(rng.integers(0, side)) for side in state.counts.shape)
+    position, row, column = near_the_end(rng, operator, state) or anywhere
     entry = naive.slot_of(position, state), row, column
     state.counts[entry] = one_step(rng, int(state.applied[entry]), operator)
     return position, row, column
@@ -861,8 +892,11 @@ def make_move_volume(rng):
 
 def make_change_place(rng):
     shape, operator, state = parts_of(read_engine(rng))
-    if len(state.cursors) > 1:
-        rewind(rng, 1 - int(state.clock[CLOCK_PLANE]), shape, operator, state)
+    coming = 1 - int(state.clock[CLOCK_PLANE])
+    for _ in range(8 if len(state.cursors) > 1 else 0):
+        rewind(rng, coming, shape, operator, state)
+        if state.cursors[coming, CURSOR_ENTRY]:
+            break
     return *changed_place(rng, operator, state), shape, operator, state
 
 
@@ -1043,6 +1077,7 @@ KERNELS = [
     Row(file_codes.decode_event_stream, make_event_stream),
     Row(file_codes.decode_ecf, make_ecf, exact_unless_refused),
     Row(file_codes.decode_groups, make_groups, exact_unless_refused),
+    Row(file_codes.parse_rows, make_rows, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.count_event, make_count_event),
     Row(ingest.start_of_bin, make_start_of_bin),

@@ -1,6 +1,7 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
 import math
+import re
 
 import numpy as np
 
@@ -209,6 +210,30 @@ def decode_groups(data, size, at, bits, out):
                 event["y"] = value // 4096 % 2048
         at += 3 * width
     return at
+
+
+def parse_rows(text, separator, wanted, digits, decimals):
+    n = 0
+    for line in bytes(text).split(b"\n"):
+        line = line.strip(b" \t")
+        if not line:
+            continue
+        if n == digits.shape[1]:
+            return -1
+        fields = re.split(re.escape(bytes([separator])) if separator else rb"[ \t]+", line)
+        if len(fields) <= max(wanted):
+            return -1
+        for k, i in enumerate(wanted):
+            number = re.fullmatch(rb"([+-]?)([0-9]*)(?:\.([0-9]*))?", fields[i].strip(b" \t"))
+            if number is None:
+                return -1
+            whole, behind = number[2], number[3] or b""
+            if not 1 <= len(whole + behind) <= 18 or (behind and int(whole + behind) >= 2**53):
+                return -1
+            digits[k, n] = int(number[1] + whole + behind)
+            decimals[k, n] = len(behind)
+        n += 1
+    return n
 
 
 def _write(events, out):

@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 
 KINDS = [(f, e) for f in ("direct", "inverse") for e in ("soft", "split", "triangle")]
@@ -19,22 +19,6 @@ EXACT_KINDS = [kind for kind in KINDS if kind[0] == "direct" or kind[1] == "tria
 LASSO_KINDS = [kind for kind in KINDS if kind not in EXACT_KINDS]
 
 GAP = 1e-6
-
-
-def random_encoder(rng, geometry, n_filters, formulation="direct", encoding="soft", **parameters):
-    """An encoder like a learned one: filters of about unit length, whitening near the identity."""
-    d = geometry.entries
-    whitening = np.eye(d) + 0.2 / np.sqrt(d) * rng.normal(size=(d, d))
-    parameters = {"threshold": 0.1, "gap": GAP} | parameters
-    return Encoder.build(
-        geometry,
-        formulation=formulation,
-        encoding=encoding,
-        filters=rng.normal(size=(n_filters, d)) / np.sqrt(d),
-        whitening=(whitening + whitening.T) / 2,
-        mean=0.1 * rng.normal(size=d),
-        **parameters,
-    )
 
 
 @dataclass(frozen=True)

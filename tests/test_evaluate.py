@@ -171,6 +171,8 @@ def test_on_train_what_is_held_out_is_not_there(animals, tmp_path):
 
 def test_of_a_packet_only_the_events_of_a_held_out_sample_are_left_out(tmp_path):
     events = tiny.steady(0, 30_000, 90)
+    events["t"][[30, 60]] = 10_000, 20_000  # the first that is left out, and the first that is not
+    events.sort(order="t")
     items = [
         Label(0, 10_000, "cat", "train"),
         Label(10_000, 10_000, "dog", "test"),
@@ -214,7 +216,8 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    assert counts.key == {"method": "counts", "setting": {"mirror": False, "kernel": "linear"}, "fold": 0}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear"}
+    assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 
 @pytest.mark.parametrize(

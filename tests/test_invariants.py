@@ -175,7 +175,7 @@ def test_features_are_those_of_the_window_after_every_batch(kind, look_ahead, da
 @pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
 @settings(max_examples=EXAMPLES)
 @given(data=st.data())
-def test_a_trace_holds_what_a_reading_after_each_event_would_have_given(kind, data):
+def test_a_trace_holds_what_an_emission_after_each_event_would_have_given(kind, data):
     case = data.draw(cases(kind))
     events = data.draw(streams(case, 40))
     engine, read = case.engine(look_ahead=True), case.engine()
@@ -191,7 +191,7 @@ def test_a_trace_holds_what_a_reading_after_each_event_would_have_given(kind, da
 @pytest.mark.parametrize("kind", KINDS, ids=ids)
 @settings(max_examples=EXAMPLES)
 @given(data=st.data())
-def test_following_leaves_nothing_to_do_for_a_reading(kind, look_ahead, data):
+def test_following_leaves_nothing_to_do_for_an_emission(kind, look_ahead, data):
     case = data.draw(cases(kind))
     events = data.draw(streams(case, 20))
     engine = case.engine(look_ahead=look_ahead)

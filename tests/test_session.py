@@ -65,10 +65,21 @@ def cut(items, rng):
         ("500us", "time", 500),
         ("2s", "time", 2_000_000),
         ("auto", "auto", 1),
+        ("bin", "bin", 1),
     ],
 )
 def test_policies_are_parsed(text, kind, every):
     assert EmitPolicy.parse(text) == EmitPolicy(kind, every)
+    assert EmitPolicy.parse(str(EmitPolicy(kind, every))) == EmitPolicy(kind, every)
+
+
+def test_at_every_bin_is_at_every_multiple_of_its_length():
+    items = tiny.labelled_items(3)
+    policies = ("bin", f"{tiny.GEOMETRY.bin_us}us")
+    bins, times = (run(items, policy)[0] for policy in policies)
+    assert [(e.t_us, e.features.tobytes()) for e in bins] == [(e.t_us, e.features.tobytes()) for e in times]
+    assert len(bins) == 6
+    assert all(e.active_volumes > 0 for e in bins if e.final)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ Lives here: its arguments, and how its result is shown.
 Not here: the evaluation (`streamfeat.evaluate`).
 """
 
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
     working,
@@ -98,6 +98,8 @@ def evaluate(
     iterations: options.Iterations = None,
     seed: options.Seed = None,
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     on: Annotated[
         str,
@@ -142,7 +144,13 @@ def evaluate(
             refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
-    base = options.setting_given(context) | {"mirror": mirror, "kernel": kernel, "model": str(model or "")}
+    base = options.setting_given(context) | {
+        "mirror": mirror,
+        "cuts": cuts,
+        "shift": shift,
+        "kernel": kernel,
+        "model": str(model or ""),
+    }
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
@@ -179,7 +187,7 @@ def evaluate(
     if output:
         save_result(output, result)
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json("evaluate", result)
     else:
         _print(result)
 

@@ -28,6 +28,7 @@ from streamfeat.cli.program import (
     err,
     model_or_general,
     out,
+    print_json,
     print_losses,
     print_result,
     progress_bars,
@@ -186,7 +187,7 @@ def listen(
         )
     )
     if not to_terminal:
-        print_result(job.result(), "heard", as_json=as_json)
+        print_result(job.result(), "heard", as_json=as_json, command="listen")
 
 
 def _spread(
@@ -208,10 +209,7 @@ def _spread(
         job = ClusterListen(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
         job.run()
     result = job.result()
-    of_each = result.pop("of_each")
-    if as_json:
-        result["of_each"] = of_each
-    print_result(result, names.expression, as_json=as_json)
+    print_result(result, names.expression, as_json=as_json, command="listen --cluster")
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
@@ -266,7 +264,7 @@ def publish(
     print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "published", as_json=as_json)
+    print_result(job.result(), "published", as_json=as_json, command="publish")
 
 
 @app.command(epilog="Example: streamfeat record 'robot/*/events' -o drive.mcap")
@@ -303,7 +301,7 @@ def record(
     )
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "recorded", as_json=as_json)
+    print_result(job.result(), "recorded", as_json=as_json, command="record")
 
 
 @app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
@@ -323,7 +321,7 @@ def recover(
     with progress_bars(quiet=quiet) as report:
         losses = recover_recording(source, target, overwrite=overwrite, report=report)
     result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
-    print_result(result, "recovered", as_json=as_json)
+    print_result(result, "recovered", as_json=as_json, command="recover")
     print_losses(losses)
 
 
@@ -344,7 +342,7 @@ def topics(
     with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
     if as_json:
-        print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)
+        print_json("topics", {"topics": [asdict(topic) for topic in found]})
         return
     for topic in found:
         where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"

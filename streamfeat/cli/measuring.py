@@ -5,7 +5,6 @@ Not here: the measurements (`latency`).
 """
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,6 +27,7 @@ from streamfeat.cli.program import (
     err,
     model_or_general,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
 )
@@ -118,7 +118,7 @@ def latency(
     except KeyboardInterrupt:  # before there is anything to show, or for the second time
         raise typer.Exit(130) from None
     if as_json:
-        typer.echo(json.dumps(report.result()))
+        print_json("latency", report.result())
     else:
         _print(report)
     if plot and report.rows:

@@ -141,7 +141,7 @@ def view(
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     job.run()
-    print_result(job.result(), "viewed", as_json=as_json)
+    print_result(job.result(), "viewed", as_json=as_json, command="view")
 
 
 def _recording(source: str | None) -> Location | None:

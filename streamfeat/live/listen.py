@@ -35,6 +35,7 @@ from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline, Processor
@@ -201,7 +202,10 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+                n_filters = self._encoder.n_filters
+                return lines.open(
+                    self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
+                )
 
             with self.opened(sinks) as pipeline:
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
@@ -233,6 +237,7 @@ class ListenJob:
             is_behind=self._is_behind,
             engine=self._engine_of(topic),
             denoising=self._denoising,
+            load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
         )
 
     def _checkpointer(self, path: Path) -> Checkpointer:

@@ -12,6 +12,7 @@ from streamfeat.errors import InputError
 __all__ = ["CdrReader", "CdrWriter"]
 
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+_NUMBERS = {code: struct.Struct(f"<{code}") for code in "BiIqQ"}
 
 
 class CdrReader:
@@ -36,10 +37,13 @@ class CdrReader:
 
     def number(self, code: str, field: str) -> int:
         """Read one integer or boolean of `struct` type `code`."""
-        size = struct.calcsize(code)
-        self._at += -(self._at - 4) % size
-        (value,) = struct.unpack(f"<{code}", self._take(size, field))
-        return int(value)
+        layout = _NUMBERS[code]
+        at = self._at - (self._at - 4) % -layout.size
+        if at + layout.size > len(self._data):
+            self._at = at
+            self._take(layout.size, field)  # says what is missing
+        self._at = at + layout.size
+        return int(layout.unpack_from(self._data, at)[0])
 
     def string(self, field: str) -> str:
         """Read a string; the zero byte that ends it is dropped."""

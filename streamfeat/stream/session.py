@@ -19,6 +19,7 @@ from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.load import Load
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
 
 __all__ = ["Session", "StreamItem"]
@@ -60,6 +61,7 @@ class Session:
         is_behind: whether the packet in hand has waited too long, given its `log_time_ns`.
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
+        load: times the work of the first second, if somebody is to be told that it is too much.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -77,18 +79,19 @@ class Session:
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
+        load: Load | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
-        self.policy = policy
+        self.policy = policy = policy.with_bins(encoder.geometry.bin_us)
         self._every_event = policy == EmitPolicy("events", 1)
         if classifier and (learn_online or self._every_event):
             classifier = classifier.linear
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock, self._topic = clock, topic
+        self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
@@ -148,7 +151,8 @@ class Session:
             self._state.open_sample(item)
             self._restart()
         else:
-            yield from self._process_packet(item)
+            work = self._process_packet(item)
+            yield from self._load.timed(work, item) if self._load and not self._load.is_done else work
 
     def _process_packet(self, packet: Packet) -> Iterator[Emission]:
         state = self._state
@@ -290,7 +294,12 @@ class Session:
             topic=self._topic,
             incomplete=incomplete,
             source_ns=self._source_ns,
+            active_volumes=self._active_volumes(),
         )
+
+    def _active_volumes(self) -> int | None:
+        """Counting them is nothing beside an emission, but much beside one event."""
+        return self._engine.stats().active_volumes if self._engine and not self._every_event else None
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)

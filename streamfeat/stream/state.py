@@ -54,7 +54,7 @@ class SessionStats:
         """Read what `asdict` wrote.
 
         Raises:
-            InputError: it is not that.
+            InputError: the values are not such counts.
         """
         names = [field.name for field in fields(cls) if field.name != "correct"]
         return cls(**{name: values.whole(name) for name in names}, correct=values.maybe("correct"))
@@ -207,7 +207,7 @@ class SessionState:
         """Read what `asdict` wrote, of a live stream.
 
         Raises:
-            InputError: it is not that, or no session could be there.
+            InputError: the values are not a state, or not one that a session can be in.
         """
         origin_us, last_us = (
             values.whole("origin_us", -_LATEST_US, _LATEST_US),
