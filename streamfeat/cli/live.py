@@ -20,6 +20,7 @@ from streamfeat.cli.program import (
     OverwriteOption,
     QuietOption,
     SpeedOption,
+    ThreadsOption,
     TopicOption,
     VerboseOption,
     WorkersOption,
@@ -135,6 +136,7 @@ def listen(
             help="Hear only cameras with a liveliness token; packets of others are not sent here.",
         ),
     ] = False,
+    threads: ThreadsOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
     zenoh_config: ConfigOption = None,
@@ -162,6 +164,7 @@ def listen(
         "network": Network(zenoh_config, port, reliable),
         "max_delay_s": max_delay,
         "state": state,
+        "threads": threads,
     }
     if cluster is not None or workers is not None:
         if output or json_lines or table or metrics or shard or announced:
@@ -169,6 +172,7 @@ def listen(
                 "on a cluster cameras need no --shard and no --announced, and features and predictions go to "
                 "the network: leave out --output, --json-lines, --table and --metrics, or use `record`"
             )
+        common["threads"] = 1 if threads is None else threads  # its workers are as many as there are cores
         _spread(names, chosen, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
     share = Shard.parse(shard) if shard is not None else None

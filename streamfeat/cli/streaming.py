@@ -19,6 +19,7 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     SpeedOption,
+    ThreadsOption,
     TopicOption,
     VerboseOption,
     app,
@@ -69,6 +70,7 @@ def replay(
         bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
     ] = False,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -91,6 +93,7 @@ def replay(
         reading=reading,
         split=split,
         learn_online=learn_online,
+        threads=threads,
     )
     print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"

@@ -12,6 +12,7 @@ from typing import Any
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.recordings.opening import RecordingPath
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
@@ -50,6 +51,7 @@ class ReplayJob:
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
+        threads: that share a large emission, see `usable_threads`.
 
     Attributes:
         advice: a line where the work on the first second took longer than the second.
@@ -74,6 +76,7 @@ class ReplayJob:
         loop: bool = False,
         learn_online: bool = False,
         engine: Callable[..., Engine] = Engine,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
@@ -102,6 +105,7 @@ class ReplayJob:
             clock=time.perf_counter,
             engine=engine,
             load=Load(self._encoder.geometry, self.advice.append),
+            threads=usable_threads(threads),
         )
         self._seconds = self._compile_seconds = 0.0
         self.interrupted = False
@@ -253,6 +257,7 @@ def replay(
     split: str | None = None,
     loop: bool = False,
     learn_online: bool = False,
+    threads: int | None = None,
 ) -> EmissionStream:
     """Replay a recording as an asynchronous iterator of emissions, those that `streamfeat replay` makes.
 
@@ -273,15 +278,16 @@ def replay(
         split: replay only samples of this split.
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
+        threads: that share a large emission; all cores but one if not given.
 
     Returns:
         the stream; nothing is opened before it is used. Iterating raises InputError where a file cannot be
         used or the parts do not fit each other.
 
     Raises:
-        InputError: `emit` or `speed` makes no sense.
+        InputError: `emit`, `speed` or `threads` makes no sense.
     """
     policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
     options: dict[str, Any] = {"topic": topic, "split": split, "loop": loop, "learn_online": learn_online}
-    options |= {"emit": policy, "speed": checked_speed(speed)}
+    options |= {"emit": policy, "speed": checked_speed(speed), "threads": usable_threads(threads)}
     return EmissionStream(lambda: ReplayJob(recording, model, classifier, **options))

@@ -7,6 +7,7 @@ Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, wh
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,7 @@ class Session:
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
         load: times the work of the first second, if somebody is to be told that it is too much.
+        threads: of the engines, see `Engine`.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -80,6 +82,7 @@ class Session:
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
         load: Load | None = None,
+        threads: int = 1,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -94,7 +97,7 @@ class Session:
         self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
-        self._make_engine = engine
+        self._make_engine = partial(engine, threads=threads)
         self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.engine.engine import Snapshot
+from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.events import TIME_LIMIT, Resolution
 from streamfeat.files.json_fields import Fields

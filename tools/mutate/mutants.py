@@ -74,8 +74,8 @@ MUTANTS = [
     Mutant(
         "a polarity of 2 is sound",
         "kernels/ingest.py",
-        "inside or p < 0 or p > 1 or t",
-        "inside or p < 0 or p > 2 or t",
+        "inside and p >> 1 == 0 and",
+        "inside and p >> 2 == 0 and",
         INGEST,
     ),
     Mutant(
