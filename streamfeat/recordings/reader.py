@@ -370,7 +370,8 @@ def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label
     events = item.events.copy()
     events["t"] += shift_us
     log_time_ns = item.log_time_ns + shift_us * 1000
-    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns)
+    until_us = None if item.until_us is None else item.until_us + shift_us
+    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns, until_us=until_us)
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
