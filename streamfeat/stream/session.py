@@ -269,9 +269,9 @@ class Session:
         return start
 
     def _scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
+        """What the classifier says of features `(n, F)`: `(n, C)`, or `(n, 0)` without one."""
         classifier = self.classifier
-        return classifier.scores(features) if classifier else np.zeros((len(features), 0), np.float32)
+        return classifier.emitted(features) if classifier else np.zeros((len(features), 0), np.float32)
 
     def _emission(
         self,
