@@ -412,3 +412,8 @@ def test_an_event_from_before_a_wrap_may_come_after_it_and_in_the_next_block():
         turn + 7,
     ]
     assert unwrapped(np.array([turn - 1, 8])).tolist() == [turn - 1, turn + 8]
+
+
+def test_nothing_is_from_before_the_first_turn_of_a_clock():
+    turn = 1 << 32
+    assert Unwrapped(32)(np.array([5, turn - 5, 7])).tolist() == [5, turn - 5, 7]
