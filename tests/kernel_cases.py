@@ -897,6 +897,23 @@ TIME_SURFACES = {
     "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
 }
 
+ROWS = {
+    "no row": lambda call: call.result == 0,
+    "rows": lambda call: call.result > 1,
+    "blanks separate": lambda call: call.separator == 0 and call.result > 0,
+    "points": lambda call: call.result > 0 and b"." in bytes(call.text),
+    "signs": lambda call: call.result > 0 and b"-" in bytes(call.text),
+    "an empty line": lambda call: call.result > 0 and b"\n  \n" in bytes(call.text),
+    "no end of the last line": lambda call: call.result > 0 and not bytes(call.text).endswith(b"\n"),
+    "no number": lambda call: call.result < 0 and b"x" in bytes(call.text),
+    "an exponent": lambda call: call.result < 0 and b"e" in bytes(call.text),
+    "19 digits": lambda call: call.result < 0 and b"1234567890123456789" in bytes(call.text),
+    "more than a float holds": lambda call: call.result < 0 and b"0.123456789012345678" in bytes(call.text),
+    "more rows than room": lambda call: (
+        call.result < 0 and bytes(call.text).count(b"\n") >= call.digits.shape[1]
+    ),
+}
+
 NO_EVENT = {"no event": lambda call: len(call.events) == 0}
 
 CASES = {
@@ -908,6 +925,7 @@ CASES = {
     "decode_groups": GROUPS,
     "time_span": TIME_SPAN,
     "mark_noise": NO_EVENT,
+    "parse_rows": ROWS,
     "advance_to_bin": ADVANCE,
     "count_event": COUNT_EVENT,
     "start_of_bin": START_OF_BIN,

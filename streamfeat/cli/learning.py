@@ -6,7 +6,7 @@ Not here: the learning itself (`learn`, `classifier`).
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,7 +42,9 @@ if TYPE_CHECKING:
     from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
+    from streamfeat.learn.settings import Setting
     from streamfeat.recordings.options import ReadOptions
+    from streamfeat.recordings.reader import Recording
 
 __all__ = ["learn", "train"]
 
@@ -99,6 +101,8 @@ def learn(
 ) -> None:
     """Learn features without labels; samples of validation and test splits are not looked at.
 
+    Without --stride, --downsample and --preset the grid is the finest that one core follows on the sensor.
+
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
     After a crash there is the file MODEL.part, which --resume takes as well.
     """
@@ -117,6 +121,8 @@ def learn(
             for rec in opened:
                 print_assumptions(rec.assumptions)
             place = files.enter_context(working(cluster, workers, quiet=quiet))
+            if preset == "default" and stride is None and downsample is None:
+                setting = _suited(opened, setting)
             report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
             encoder = learn_encoder(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
@@ -161,6 +167,20 @@ def learn(
             soft_wrap=True,
         )
         raise typer.Exit(130)
+
+
+def _suited(opened: "Sequence[Recording]", setting: "Setting") -> "Setting":
+    """The grid for the sensor, and a line where that is not the default one."""
+    from streamfeat.learn.sensor import suited_to
+
+    found = suited_to(opened, setting)
+    if (found.stride, found.downsample) != (setting.stride, setting.downsample):
+        err.print(
+            f"[dim]geometry:[/] --stride {found.stride} --downsample {found.downsample}, the finest that one "
+            "core follows with --emit 10ms on a sensor of this size; give either for another",
+            soft_wrap=True,
+        )
+    return found
 
 
 def _keeper(path: Path) -> "Keep":

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from streamfeat.cli.program import (
     EmitOption,
@@ -21,6 +22,7 @@ from streamfeat.cli.program import (
     TopicOption,
     VerboseOption,
     app,
+    err,
     model_or_general,
     out,
     print_losses,
@@ -107,5 +109,7 @@ def replay(
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
+    for line in job.advice:
+        err.print(f"[yellow]too much work:[/] {escape(line)}", soft_wrap=True)
     if job.interrupted:
         raise typer.Exit(130)

@@ -34,6 +34,7 @@ from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline, Processor
@@ -235,6 +236,7 @@ class ListenJob:
             is_behind=self._is_behind,
             engine=self._engine_of(topic),
             denoising=self._denoising,
+            load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
         )
 
     def _checkpointer(self, path: Path) -> Checkpointer:

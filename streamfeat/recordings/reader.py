@@ -10,7 +10,6 @@ counted in `Recording.losses`; only a recording that yields nothing at all is an
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from types import TracebackType
@@ -36,6 +35,7 @@ from streamfeat.recordings.sources import (
     SourceItem,
     StoredMessage,
     Topic,
+    labels_in,
     unpacked_message,
 )
 from streamfeat.recordings.totals import Totals
@@ -316,12 +316,7 @@ class Recording(Shown):
         if self._labels is not None:
             yield from self.labels  # they are put into the stream by its times
         elif self.is_labelled:
-            for at, stored in self._source.read(self.topic, self._part, Losses()):
-                if at >= self._part.end:
-                    return
-                if isinstance(stored, StoredMessage) and stored.schema == LabelMessage.SCHEMA_NAME:
-                    with suppress(InputError):
-                        yield Label.from_cdr(unpacked_message(stored.data))
+            yield from labels_in(self._source, self.topic, self._part)
 
     @property
     def n_on(self) -> int:

@@ -19,6 +19,7 @@ from streamfeat.recordings.reader import Label, Packet, Recording, open_recordin
 from streamfeat.recordings.records import Losses
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline
@@ -49,6 +50,11 @@ class ReplayJob:
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
+
+    Attributes:
+        advice: a line where the work on the first second took longer than the second.
+        assumptions: what the recording leaves open, and how that was decided.
+        interrupted: whether a signal ended it.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -87,6 +93,7 @@ class ReplayJob:
             if split is not None and split not in {label.split for label in rec.labels}:
                 raise InputError(f"{rec.path}: has no samples of split {split!r}")
         self._labels = reader.labels if reader else ()
+        self.advice: list[str] = []
         self._session = Session(
             self._encoder,
             self._policy,
@@ -94,6 +101,7 @@ class ReplayJob:
             learn_online=learn_online,
             clock=time.perf_counter,
             engine=engine,
+            load=Load(self._encoder.geometry, self.advice.append),
         )
         self._seconds = self._compile_seconds = 0.0
         self.interrupted = False

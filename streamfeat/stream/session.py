@@ -20,6 +20,7 @@ from streamfeat.events import Events, Resolution
 from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.load import Load
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
 
 __all__ = ["Session", "StreamItem"]
@@ -61,6 +62,7 @@ class Session:
         is_behind: whether the packet in hand has waited too long, given its `log_time_ns`.
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
+        load: times the work of the first second, if somebody is to be told that it is too much.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -78,6 +80,7 @@ class Session:
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
+        load: Load | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -89,7 +92,7 @@ class Session:
             classifier = classifier.linear
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock, self._topic = clock, topic
+        self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = engine
@@ -152,7 +155,8 @@ class Session:
             self._is_label_new = True
             self._restart()
         else:
-            yield from self._process_packet(item)
+            work = self._process_packet(item)
+            yield from self._load.timed(work, item) if self._load and not self._load.is_done else work
 
     def _process_packet(self, packet: Packet) -> Iterator[Emission]:
         state = self._state
