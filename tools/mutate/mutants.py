@@ -39,14 +39,14 @@ MUTANTS = [
     Mutant(
         "mark_dirty forgets the partly projected volume",
         "kernels/update.py",
-        "inside = volume < last or (volume == last and entry < last_entry)",
+        "inside = volume < last or (volume == last and line_entry - c * stride < last_entry)",
         "inside = volume < last",
         MARKED,
     ),
     Mutant(
         "mark_dirty takes every entry of that volume",
         "kernels/update.py",
-        "(volume == last and entry < last_entry)",
+        "(volume == last and line_entry - c * stride < last_entry)",
         "volume == last",
         MARKED,
     ),
