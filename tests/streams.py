@@ -32,6 +32,7 @@ class Case:
     encoding: str
     threshold: float
     seed: int
+    threads: int = 1
 
     @cached_property
     def encoder(self):
@@ -41,7 +42,8 @@ class Case:
         )
 
     def engine(self, origin_us=0, *, look_ahead=False):
-        return Engine(self.encoder, self.resolution, origin_us=origin_us, look_ahead=look_ahead)
+        options = {"look_ahead": look_ahead, "threads": self.threads}
+        return Engine(self.encoder, self.resolution, origin_us=origin_us, **options)
 
 
 @st.composite
@@ -66,6 +68,7 @@ def cases(draw, kind, max_bins=4):
         encoding,
         draw(st.sampled_from([0.02, 0.3])),
         draw(st.integers(0, 1000)),
+        draw(st.sampled_from([1, 2, 3])),
     )
 
 

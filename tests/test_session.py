@@ -8,6 +8,7 @@ import tiny
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures, encode_samples, sample_end
+from streamfeat.engine import threads
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
@@ -564,3 +565,18 @@ def test_a_session_that_emits_as_often_as_it_can_does_not_look_ahead():
     resting.clock.now += 100.0
     resting.session.rest()
     assert resting.asked == []
+
+
+@pytest.mark.parametrize("policy", ["10ms", "auto"])
+def test_any_number_of_threads_makes_the_same_emissions(policy, monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_A_PART", 1)
+    monkeypatch.setattr(threads, "WORTH_COUNTING", 0)
+    items = [
+        tiny.packet(tiny.steady(start, start + 50_000, 2000, seed=start)) for start in (0, 50_000, 100_000)
+    ]
+    one, _ = run(items, policy)
+    three, session = run(items, policy, threads=3)
+    assert session._engine._crew.threads == 3
+    assert [e.t_us for e in three] == [e.t_us for e in one]
+    for mine, yours in zip(three, one, strict=True):
+        np.testing.assert_array_equal(mine.features, yours.features)

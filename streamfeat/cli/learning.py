@@ -6,7 +6,7 @@ Not here: the learning itself (`learn`, `classifier`).
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,7 +42,9 @@ if TYPE_CHECKING:
     from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
+    from streamfeat.learn.settings import Setting
     from streamfeat.recordings.options import ReadOptions
+    from streamfeat.recordings.reader import Recording
 
 __all__ = ["learn", "train"]
 
@@ -99,6 +101,8 @@ def learn(
 ) -> None:
     """Learn features without labels; samples of validation and test splits are not looked at.
 
+    Without --stride, --downsample and --preset the grid is the finest that one core follows on the sensor.
+
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
     After a crash there is the file MODEL.part, which --resume takes as well.
     """
@@ -117,6 +121,8 @@ def learn(
             for rec in opened:
                 print_assumptions(rec.assumptions)
             place = files.enter_context(working(cluster, workers, quiet=quiet))
+            if preset == "default" and stride is None and downsample is None:
+                setting = _suited(opened, setting)
             report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
             encoder = learn_encoder(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
@@ -163,6 +169,20 @@ def learn(
         raise typer.Exit(130)
 
 
+def _suited(opened: "Sequence[Recording]", setting: "Setting") -> "Setting":
+    """The grid for the sensor, and a line where that is not the default one."""
+    from streamfeat.learn.sensor import suited_to
+
+    found = suited_to(opened, setting)
+    if (found.stride, found.downsample) != (setting.stride, setting.downsample):
+        err.print(
+            f"[dim]geometry:[/] --stride {found.stride} --downsample {found.downsample}, the finest that one "
+            "core follows with --emit 10ms on a sensor of this size; give either for another",
+            soft_wrap=True,
+        )
+    return found
+
+
 def _keeper(path: Path) -> "Keep":
     """Keep what was learned so far in a file, as often as that takes no more than a twentieth of the time."""
     due = 0.0
@@ -203,6 +223,7 @@ def train(
     """Train a classifier on labelled samples; splits named validation or test are only scored."""
     import numpy as np
 
+    from streamfeat.classify.calibration import calibration_error
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
@@ -240,7 +261,7 @@ def train(
         trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
     found: Classifier | KernelClassifier = trained
     if kernel == "rbf":
-        found = train_kernel_classifier(rows, trained, np.asarray(labels))
+        found = train_kernel_classifier(rows, trained, np.asarray(labels), parts[numbers])
     found.save(classifier)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
@@ -252,9 +273,13 @@ def train(
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
     if len(held_out):
-        predicted = [found.predict(row) for row in held_out]
-        share = (samples.labels[samples.held_out] == predicted).mean()
+        likely, true = found.emitted(held_out), samples.labels[samples.held_out]
+        share = (true == np.array(found.labels)[likely.argmax(axis=1)]).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
+        known = np.isin(true, found.labels)
+        if known.any():
+            places = np.searchsorted(found.labels, true[known])
+            result["held_out_calibration_error"] = round(calibration_error(likely[known], places), 4)
     print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)

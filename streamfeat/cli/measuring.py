@@ -21,6 +21,7 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     StepsOption,
+    ThreadsOption,
     TopicOption,
     app,
     completing,
@@ -82,6 +83,7 @@ def latency(
         Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
     ] = None,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -106,6 +108,7 @@ def latency(
         seconds=seconds,
         speed=speed,
         look_ahead=look_ahead,
+        threads=threads,
     )
     print_assumptions(report.assumptions)
     try:

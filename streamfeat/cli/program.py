@@ -173,6 +173,13 @@ ModelOption = Annotated[
     Path | None,
     typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
 ]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Threads that share a large emission; features are the same for any number.",
+        show_default="all cores but one",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from streamfeat.cli.program import (
     EmitOption,
@@ -18,9 +19,11 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     SpeedOption,
+    ThreadsOption,
     TopicOption,
     VerboseOption,
     app,
+    err,
     model_or_general,
     out,
     print_losses,
@@ -67,6 +70,7 @@ def replay(
         bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
     ] = False,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -89,6 +93,7 @@ def replay(
         reading=reading,
         split=split,
         learn_online=learn_online,
+        threads=threads,
     )
     print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"
@@ -107,5 +112,7 @@ def replay(
     if not to_terminal:
         print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
+    for line in job.advice:
+        err.print(f"[yellow]too much work:[/] {escape(line)}", soft_wrap=True)
     if job.interrupted:
         raise typer.Exit(130)

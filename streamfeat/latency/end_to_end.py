@@ -43,6 +43,7 @@ def measure_end_to_end(
     *,
     speed: float,
     look_ahead: bool,
+    threads: int = 1,
     warm_up: Iterable[Item] = (),
     goes: Callable[[], bool] = lambda: True,
 ) -> NDArray[np.int64]:
@@ -54,6 +55,7 @@ def measure_end_to_end(
         policy: when features are read.
         speed: stream seconds for each second of the clock.
         look_ahead: whether engines look ahead where the policy reads after every event.
+        threads: of the engines, see `Engine`.
         warm_up: items that run through the same parts beforehand, as fast as possible.
         goes: asked 20 times a second whether to go on.
 
@@ -64,7 +66,7 @@ def measure_end_to_end(
         InputError: a sensor has no place for a volume.
     """
     engine = partial(_engine, look_ahead)
-    warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
+    warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine, threads=threads)
     warmed: Pipeline[Item, Emission] = Pipeline(warm_up, warming, [_WatchedSink()])
     asyncio.run(warmed.run())
     started: list[tuple[int, int]] = []
@@ -73,7 +75,7 @@ def measure_end_to_end(
         if not started:
             started.append((monotonic_ns(), t_us))
 
-    session = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
+    session = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine, threads=threads)
     sink = _WatchedSink()
     pipeline: Pipeline[Item, Emission] = Pipeline(
         without_silence(items, encoder.geometry.window_us),

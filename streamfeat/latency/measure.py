@@ -14,6 +14,7 @@ import numpy as np
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.latency.end_to_end import measure_end_to_end
@@ -93,6 +94,7 @@ class LatencyReport:
         seconds: clock seconds that each measurement takes at most.
         speed: of the end to end, a multiple of the recorded pace.
         look_ahead: prepare bin boundaries beforehand where every event is followed.
+        threads: that share a large emission, see `usable_threads`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -112,6 +114,7 @@ class LatencyReport:
         seconds: float = 2.0,
         speed: float = 1.0,
         look_ahead: bool = True,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything, without measuring."""
         for name, value, most in (("--seconds", seconds, _MOST_SECONDS), ("--speed", speed, 1e9)):
@@ -124,7 +127,7 @@ class LatencyReport:
                 raise InputError(f"{name} {count} is not possible; give at least {least}")
         self._policies = [(emit, EmitPolicy.parse(emit)) for emit in dict.fromkeys(emits)]
         self._recording, self._topic, self._split = recording, topic, split
-        self._reading = reading
+        self._reading, self._threads = reading, usable_threads(threads)
         self._warm_up, self._limit = warm_up, limit_events
         self._seconds, self._speed, self._look_ahead = seconds, speed, look_ahead
         names = [path.stem for path in models]
@@ -184,6 +187,7 @@ class LatencyReport:
             "seconds": self._seconds,
             "speed": self._speed,
             "look_ahead": self._look_ahead,
+            "threads": self._threads,
             "interrupted": self.interrupted,
             "models": [model.describe() for model in self._models],
             "rows": [
@@ -268,6 +272,7 @@ class LatencyReport:
             job.policy,
             speed=self._speed,
             look_ahead=self._look_ahead,
+            threads=self._threads,
             warm_up=_first_events(self._items, self._warm_up),
             goes=goes,
         )

@@ -18,11 +18,12 @@ from rich.live import Live
 
 from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.intake import SILENCE_S, Intake
 from streamfeat.live.names import Names, PlainNames, RosNames, beside
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import OutputSink
@@ -30,10 +31,12 @@ from streamfeat.live.screen import HealthTable
 from streamfeat.live.shard import Shard
 from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import Barrier
+from streamfeat.live.warnings import Warnings
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline, Processor
@@ -78,6 +81,7 @@ class ListenJob:
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
         tap: what items pass through before anything is computed from them.
+        threads: that share a large emission, for each camera; see `usable_threads`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -106,6 +110,7 @@ class ListenJob:
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
         tap: Callable[[Iterable[Any]], Iterable[Any]] = lambda items: items,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
@@ -124,7 +129,7 @@ class ListenJob:
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._network, self._publish = learn_online, network, publish
-        self._engine_of, self._tap = engine_of, tap
+        self._engine_of, self._tap, self._threads = engine_of, tap, usable_threads(threads)
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
         self._warnings = Warnings.on(console)
@@ -168,7 +173,7 @@ class ListenJob:
             checkpointed: list[Sink[Emission]] = []
             published: list[Sink[Emission]] = []
             if self._publish:
-                published = [OutputSink(session, self._names, self.health.on_published)]
+                published = [OutputSink(session, self._names, self.health.on_published, self._on_unpublished)]
             written = sinks()
             if self._state:
                 # Last of the sinks: what it keeps says that all others have written.
@@ -235,6 +240,8 @@ class ListenJob:
             is_behind=self._is_behind,
             engine=self._engine_of(topic),
             denoising=self._denoising,
+            load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
+            threads=self._threads,
         )
 
     def _checkpointer(self, path: Path) -> Checkpointer:
@@ -249,6 +256,9 @@ class ListenJob:
 
     def _is_behind(self, log_time_ns: int) -> bool:
         return time.time_ns() - log_time_ns > self._patience_ns
+
+    def _on_unpublished(self, topic: str, error: str) -> None:
+        self._warnings.add("not published", topic, error)
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
         self._warnings.add(reason, topic, error)
@@ -281,6 +291,7 @@ def listen(
     zenoh_config: str | PathLike[str] | None = None,
     reliable: bool = False,
     publish: bool = False,
+    threads: int | None = None,
 ) -> EmissionStream:
     """Listen to live topics as an asynchronous iterator of emissions, those that `streamfeat listen` makes.
 
@@ -307,16 +318,18 @@ def listen(
         zenoh_config: JSON5 configuration of zenoh; without it, this machine alone.
         reliable: recover missed packets, from publishers that do the same.
         publish: publish features and predictions beside the events, too.
+        threads: that share a large emission, for each camera; all cores but one if not given.
 
     Returns:
         the stream; nothing is opened before it is used. Iterating raises InputError where a file or the
         network cannot be used.
 
     Raises:
-        InputError: a topic, `emit` or `port` makes no sense.
+        InputError: a topic, `emit`, `port` or `threads` makes no sense.
     """
     names: Names = RosNames(topics, ros_domain) if topics.startswith("/") else PlainNames(topics)
     policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+    usable_threads(threads)  # now, not when it is used
     network = Network(Path(zenoh_config) if zenoh_config else None, port, reliable)
 
     def make_job() -> ListenJob:
@@ -329,6 +342,7 @@ def listen(
             max_delay_s=max_delay_s,
             network=network,
             publish=publish,
+            threads=threads,
         )
 
     return EmissionStream(make_job)

@@ -12,6 +12,7 @@ from typing import Any
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.recordings.opening import RecordingPath
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
@@ -19,6 +20,7 @@ from streamfeat.recordings.reader import Label, Packet, Recording, open_recordin
 from streamfeat.recordings.records import Losses
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline
@@ -49,6 +51,12 @@ class ReplayJob:
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
+        threads: that share a large emission, see `usable_threads`.
+
+    Attributes:
+        advice: a line where the work on the first second took longer than the second.
+        assumptions: what the recording leaves open, and how that was decided.
+        interrupted: whether a signal ended it.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -68,6 +76,7 @@ class ReplayJob:
         loop: bool = False,
         learn_online: bool = False,
         engine: Callable[..., Engine] = Engine,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
@@ -87,6 +96,7 @@ class ReplayJob:
             if split is not None and split not in {label.split for label in rec.labels}:
                 raise InputError(f"{rec.path}: has no samples of split {split!r}")
         self._labels = reader.labels if reader else ()
+        self.advice: list[str] = []
         self._session = Session(
             self._encoder,
             self._policy,
@@ -94,6 +104,8 @@ class ReplayJob:
             learn_online=learn_online,
             clock=time.perf_counter,
             engine=engine,
+            load=Load(self._encoder.geometry, self.advice.append),
+            threads=usable_threads(threads),
         )
         self._seconds = self._compile_seconds = 0.0
         self.interrupted = False
@@ -245,6 +257,7 @@ def replay(
     split: str | None = None,
     loop: bool = False,
     learn_online: bool = False,
+    threads: int | None = None,
 ) -> EmissionStream:
     """Replay a recording as an asynchronous iterator of emissions, those that `streamfeat replay` makes.
 
@@ -265,15 +278,16 @@ def replay(
         split: replay only samples of this split.
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
+        threads: that share a large emission; all cores but one if not given.
 
     Returns:
         the stream; nothing is opened before it is used. Iterating raises InputError where a file cannot be
         used or the parts do not fit each other.
 
     Raises:
-        InputError: `emit` or `speed` makes no sense.
+        InputError: `emit`, `speed` or `threads` makes no sense.
     """
     policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
     options: dict[str, Any] = {"topic": topic, "split": split, "loop": loop, "learn_online": learn_online}
-    options |= {"emit": policy, "speed": checked_speed(speed)}
+    options |= {"emit": policy, "speed": checked_speed(speed), "threads": usable_threads(threads)}
     return EmissionStream(lambda: ReplayJob(recording, model, classifier, **options))

@@ -7,6 +7,7 @@ Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, wh
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,10 @@ from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
-from streamfeat.events import Events, Resolution
-from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.load import Load
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
 
 __all__ = ["Session", "StreamItem"]
@@ -61,6 +62,8 @@ class Session:
         is_behind: whether the packet in hand has waited too long, given its `log_time_ns`.
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
+        load: times the work of the first second, if somebody is to be told that it is too much.
+        threads: of the engines, see `Engine`.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -78,6 +81,8 @@ class Session:
         is_behind: Callable[[int], bool] = lambda log_time_ns: False,
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
+        load: Load | None = None,
+        threads: int = 1,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
@@ -89,17 +94,16 @@ class Session:
             classifier = classifier.linear
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock, self._topic = clock, topic
+        self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
-        self._make_engine = engine
+        self._make_engine = partial(engine, threads=threads)
         self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
         self._log_time_ns = self._source_ns = 0
-        self._is_label_new = False
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -131,7 +135,6 @@ class Session:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
         self._state = snapshot.state.resumed(self._state.every_us)
-        self._is_label_new = self._state.is_untouched
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -149,10 +152,10 @@ class Session:
         elif isinstance(item, Label):
             yield from self._finish_sample()
             self._state.open_sample(item)
-            self._is_label_new = True
             self._restart()
         else:
-            yield from self._process_packet(item)
+            work = self._process_packet(item)
+            yield from self._load.timed(work, item) if self._load and not self._load.is_done else work
 
     def _process_packet(self, packet: Packet) -> Iterator[Emission]:
         state = self._state
@@ -162,10 +165,12 @@ class Session:
         self._log_time_ns, self._source_ns = packet.log_time_ns, packet.source_ns
         events = packet.events
         if len(events) == 0:
+            if packet.until_us is not None:
+                yield from self._pass_time(packet.until_us)
             return
-        self._is_label_new = False
+        state.touch()
         engine = self._engine_for(packet.resolution)
-        valid = _valid(events, packet.resolution)
+        valid = is_valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
         end = len(events)
         if state.sample and state.sample_end_us is not None:
@@ -201,7 +206,7 @@ class Session:
             self._state.epoch = epoch
             return
         # A label right before the first packet of a new clock is of that clock.
-        if not self._is_label_new:
+        if not self._state.is_untouched:
             yield from self._finish_sample()
         self._state.begin_epoch(epoch)
         self._restart()
@@ -264,9 +269,9 @@ class Session:
         return start
 
     def _scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The scores of features `(n, F)`: `(n, C)`, or `(n, 0)` without a classifier."""
+        """What the classifier says of features `(n, F)`: `(n, C)`, or `(n, 0)` without one."""
         classifier = self.classifier
-        return classifier.scores(features) if classifier else np.zeros((len(features), 0), np.float32)
+        return classifier.emitted(features) if classifier else np.zeros((len(features), 0), np.float32)
 
     def _emission(
         self,
@@ -366,14 +371,6 @@ class Session:
                 self._stats.unknown_labels += 1
         self._state.close_sample()
         yield emission
-
-
-def _valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
-    """Which events an engine will not reject."""
-    height, width = resolution
-    x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
-    valid: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
-    return valid & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import write_atomically
 from streamfeat.files.locations import Location
@@ -70,6 +71,7 @@ class View:
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
         loop: start a recording again at its end.
         labels: labels of the recording that the page changes.
+        threads: that share a large emission, see `usable_threads`.
         say: told addresses, and what is waited for.
         options: further ones of `PlayJob`, `WatchJob` or `ListenJob`.
 
@@ -92,6 +94,7 @@ class View:
         speed: float | None = 1.0,
         loop: bool = False,
         labels: LabelSheet | None = None,
+        threads: int | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
@@ -100,6 +103,7 @@ class View:
             raise InputError(f"--rate {rate:g} is not possible; give up to {_MAX_RATE:g} pictures a second")
         if classifier and not model:
             raise InputError("a classifier reads features: give the model it was trained with, too (-m)")
+        threads = usable_threads(threads)
         self._encoder = Encoder.load(model) if model else None
         self._policy = EmitPolicy.parse(emit)
         reader = load_classifier(classifier) if classifier else None
@@ -134,6 +138,7 @@ class View:
                 loop=loop,
                 stays=self._is_served,
                 make_engine=self._engine_of(""),
+                threads=threads,
                 on_player=self._tell("player"),
                 on_timeline=self._tell("timeline") if web_port is not None else None,
                 on_pieces=self._place,
@@ -146,6 +151,7 @@ class View:
                 classifier,
                 emit=emit,
                 engine_of=self._engine_of,
+                threads=threads,
                 tap=self._tap.items,
                 publish=False,
                 **options,

@@ -18,10 +18,11 @@ from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
 from streamfeat.live.names import Names
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.subscription import Subscription
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Recording, open_recording
@@ -69,6 +70,7 @@ class PlayJob:
         topic: event topic, where there are several.
         reading: how to read what is no MCAP, and what to take out.
         make_engine: makes the engines, see `Session`.
+        threads: of the engines, see `Session`.
         on_player: told what the page shows of the player.
         on_timeline: told the event rate over the recording; without it, it is not counted.
         on_pieces: told which stream time is played when, see `Timeline`.
@@ -91,6 +93,7 @@ class PlayJob:
         topic: str | None = None,
         reading: ReadOptions = AS_IT_IS,
         make_engine: Callable[..., Engine] = Engine,
+        threads: int = 1,
         on_player: Callable[[dict[str, Any]], None] = lambda state: None,
         on_timeline: Callable[[dict[str, Any]], None] | None = None,
         on_pieces: Callable[[Sequence[Piece], int], None] = lambda pieces, end_us: None,
@@ -105,7 +108,7 @@ class PlayJob:
             if split is not None and split not in {label.split for label in recording.labels}:
                 raise InputError(f"{source}: has no samples of split {split!r}")
         self._session = (
-            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine)
+            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine, threads=threads)
             if encoder
             else None
         )

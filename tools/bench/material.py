@@ -115,7 +115,7 @@ class Updates:
         newest = int(burst.events["t"].max())
         counts = count_window(geometry, burst.before, burst.resolution, burst.origin_us, newest)
         unclipped = count_window(
-            sf.Geometry(**_fields(geometry) | {"max_count": 2**15 - 1}),
+            sf.Geometry(**_fields(geometry) | {"max_count": 2**14 - 1}),
             burst.before,
             burst.resolution,
             burst.origin_us,
