@@ -202,6 +202,13 @@ RESULTS: dict[str, dict[str, Field]] = {
         **_DELIVERY,
         **_ARRIVAL,
         "other_shards_packets": Field("int?", "packets of cameras of other shards, with --shard"),
+        **_counts(
+            clock_restarts="cameras' clocks that started anew",
+            clock_jumps="cameras' clocks that jumped ahead by more than a minute",
+            clock_wraps="cameras' clocks that wrapped, which is undone",
+            stray_packets="packets with absurd times, which were left out",
+            stray_events="events with absurd times, which were left out",
+        ),
         "warnings": _WARNINGS,
         "end_to_end_p50_ms": Field("number?", "publication to features, median", "latency p50, ms"),
         "end_to_end_p99_ms": Field("number?", "the same, 99th percentile", "latency p99, ms"),
