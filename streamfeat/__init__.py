@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from streamfeat.live.listen import listen
     from streamfeat.recordings.reader import open_recording
     from streamfeat.recordings.writer import RecordingWriter
+    from streamfeat.shipped.general import general_encoder
     from streamfeat.stream.emission import Emission, EmitPolicy
     from streamfeat.stream.pipeline import Pipeline
     from streamfeat.stream.replay import replay
@@ -45,6 +46,7 @@ __all__ = [
     "TransformLearner",
     "__version__",
     "as_events",
+    "general_encoder",
     "learn_encoder",
     "listen",
     "make_events",
@@ -69,6 +71,7 @@ _HOMES = {
     "Session": "stream.session",
     "TransformLearner": "learn.transform",
     "as_events": "events",
+    "general_encoder": "shipped.general",
     "learn_encoder": "learn.from_files",
     "listen": "live.listen",
     "make_events": "events",

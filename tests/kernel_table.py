@@ -9,6 +9,7 @@ from typing import Any
 
 import naive
 import numpy as np
+from camera_files_scene import ecf
 from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random_events
 
 from streamfeat.engine.engine import Engine
@@ -21,6 +22,7 @@ from streamfeat.kernels import (
     decode,
     denoise,
     encode,
+    file_codes,
     follow,
     ingest,
     lasso,
@@ -29,14 +31,17 @@ from streamfeat.kernels import (
     update,
     volume,
 )
+from streamfeat.kernels.file_codes import ECF_PADDING
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
+    CLOCK_SLOT,
     CLOCK_TOUCHED,
     CURSOR_CODED,
+    CURSOR_ENTRY,
     CURSOR_PROJECTED,
     LANES,
     MOMENT_SQUARES,
@@ -357,6 +362,8 @@ def random_values(rng, operator):
     limit, d = operator.max_count, len(operator.columns)
     values = rng.integers(-limit, limit + 1, d).astype(np.int16)
     values[rng.random(d) < rng.random()] = 0
+    if rng.random() < 0.1:
+        values[:] = 1  # no variance
     return values
 
 
@@ -381,6 +388,8 @@ def make_deviation(rng):
 
 def make_whitened_square(rng):
     operator, _, moments = random_volume(rng, [("direct", "triangle"), ("inverse", "soft")])
+    if rng.random() < 0.3:
+        moments[2:] = rng.integers(-(2**40), 2**40, 2)  # of no volume: what comes out is bounded
     return moments, naive.deviation(moments, len(operator.columns), operator.eps), operator
 
 
@@ -467,7 +476,10 @@ def make_mean_distance(rng):
 
 
 def make_start_of_bin(rng):
-    return (parts_of(random_engine(rng))[1],)
+    _, state = parts_of(random_engine(rng))
+    if rng.random() < 0.3:
+        state.clock[CLOCK_NOW] = BEFORE_TIME
+    return (state,)
 
 
 def make_slot_of(rng):
@@ -482,36 +494,100 @@ def make_fixed_distance(rng):
 
 
 def make_evt3(rng):
-    words = random_words(rng, [0, 2, 2, 3, 4, 5, 6, 8, 10])
-    return words, np.zeros(6, np.int64), np.zeros(12 * len(words), EVENT_DTYPE)
+    words = random_words(rng, [0, 2, 2, 3, 4, 5, 6, 8, 8, 10])
+    state = np.zeros(6, np.int64)
+    if rng.random() < 0.5:  # what a packet before has left
+        high, low, row, column = int(rng.integers(0, 2**20)), *(int(v) for v in rng.integers(0, 2**11, 3))
+        column = int(pick(rng, [column, 65_520, 65_530]))
+        state[:] = high, low, row, column, rng.integers(0, 2), rng.integers(0, 5)
+    is_high = words >> 12 == 8
+    steps = rng.choice([0, 1, 7, 2047, 2048, 2049, 4090, 4095], is_high.sum())
+    words[is_high] = 8 << 12 | (state[0] + np.cumsum(steps)) % 4096
+    return words, state, np.zeros(12 * len(words), EVENT_DTYPE)
 
 
 def make_libcaer_cmp(rng):
     words = random_words(rng, [0, 1, 2, 3, 3, 4, 5] + [6] * (rng.random() < 0.1))
-    return words, int(rng.integers(0, 2**50)), np.zeros(3, np.int64), np.zeros(8 * len(words), EVENT_DTYPE)
+    state = np.zeros(3, np.int64)
+    if rng.random() < 0.5:  # what a packet before has left
+        state[:] = rng.integers(0, 2**11), pick(rng, [0, 65_520, 65_530]), rng.integers(0, 2)
+        words[:1] = 5 << 12 | rng.integers(0, 256)
+    return words, int(rng.integers(0, 2**50)), state, np.zeros(8 * len(words), EVENT_DTYPE)
 
 
 def make_mono(rng):
-    words = rng.integers(0, 2**64, int(rng.integers(0, 80)), np.uint64)
+    words = rng.integers(0, 2**64, random_length(rng, 80), np.uint64)
     return words, int(rng.integers(0, 2**54)), int(rng.integers(0, 1000)), np.zeros(len(words), EVENT_DTYPE)
 
 
 def make_time_span(rng):
-    events = np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
+    events = np.zeros(random_length(rng, 40), EVENT_DTYPE)
     events["x"], events["y"] = rng.integers(0, 12, len(events)), rng.integers(0, 12, len(events))
     events["t"] = rng.integers(-(2**62), 2**62, len(events))
     return events, int(rng.integers(1, 12)), int(rng.integers(1, 12)), np.array([7, 7])
 
 
+def make_event_stream(rng):
+    data = rng.integers(0, 256, int(rng.integers(0, 80)), np.uint8)
+    data[rng.random(len(data)) < 0.3] |= 0xFC
+    state = np.array([*rng.integers(0, 2**40, 2), 0])
+    return data, bool(rng.random() < 0.5), state, np.zeros(len(data) // 5, EVENT_DTYPE)
+
+
+def make_ecf(rng):
+    n = int(rng.integers(0, 60))
+    events = np.zeros(n, EVENT_DTYPE)
+    steps = rng.choice([0, 0, 1, 14, 15, 16, 300_000], n) * (rng.random() < 0.8)
+    events["t"] = np.cumsum(steps) + int(rng.integers(0, 2**40))
+    events["y"] = np.repeat(rng.integers(0, 2048, n), int(pick(rng, [1, 3, 40])))[:n]
+    events["x"] = np.minimum(np.cumsum(rng.choice([1, 1, 2, 7], n)), 2047)
+    events["p"] = np.repeat(rng.integers(0, 2, n), int(pick(rng, [1, 2, 130])))[:n]
+    data = np.frombuffer(ecf(events, int(pick(rng, [0, 1, 2]))), np.uint8).copy()
+    if rng.random() < 0.3:
+        data = data[: int(rng.integers(12, len(data) + 1))]
+    if rng.random() < 0.3:
+        data[int(rng.integers(4, len(data)))] = rng.integers(0, 256)
+    return np.concatenate([data, np.zeros(ECF_PADDING, np.uint8)]), len(data), np.zeros(n, EVENT_DTYPE)
+
+
+def make_rows(rng):
+    separator = pick(rng, [b",", b";", b" "])
+    numbers = [b"1", b"-20", b"+3", b"0.5", b".25", b"7.", b"123456789012345678", b" 4\t"]
+    bad = [b"", b".", b"-", b"1e5", b"x", b"1234567890123456789", b"0.123456789012345678", b"1 2", b"--1"]
+    rows = []
+    for _ in range(int(rng.integers(0, 6))):
+        kinds = numbers + bad * (rng.random() < 0.15)
+        rows.append(separator.join(pick(rng, kinds) for _ in range(int(rng.integers(3, 6)))))
+        rows += [b"  "] * (rng.random() < 0.2)
+    text = b"\n".join(rows) + b"\n" * (rng.random() < 0.9)
+    wanted = np.array(pick(rng, [[0, 1, 2], [0, 2], [1], [2, 3]]))
+    out = np.zeros((2, len(wanted), int(pick(rng, [3, 9, 9]))), np.int64)
+    code = separator[0] if separator != b" " else 0
+    return np.frombuffer(text, np.uint8).copy(), code, wanted, out[0].copy(), out[1].copy()
+
+
+def make_groups(rng):
+    data = rng.integers(0, 256, 140, np.uint8)
+    bits = int(pick(rng, [12, 24]))
+    return data, int(rng.integers(0, 125)), 3, bits, np.zeros(int(rng.integers(0, 40)), EVENT_DTYPE)
+
+
+def random_length(rng, most):
+    """Of a batch, which is often enough empty."""
+    return 0 if rng.random() < 0.1 else int(rng.integers(1, most))
+
+
 def random_words(rng, kinds):
-    n = int(rng.integers(0, 80))
+    n = random_length(rng, 80)
     return (rng.choice(kinds, n) << 12 | rng.integers(0, 4096, n)).astype(np.uint16)
 
 
 def make_advance_to_bin(rng):
     operator, state = parts_of(read_engine(rng) if rng.random() < 0.7 else random_engine(rng))
-    new = max(int(state.clock[CLOCK_NOW]), -5000) + int(pick(rng, [1, 1, 1, -2, -1, 0, 2, 3, 7]))
-    return new, operator, state
+    if rng.random() < 0.1:
+        state.clock[CLOCK_NOW] = BEFORE_TIME
+    steps = [1, 1, 1, -2, -1, 0, 2, len(state.counts), 7]
+    return max(int(state.clock[CLOCK_NOW]), -5000) + int(pick(rng, steps)), operator, state
 
 
 def hostile_events(rng, engine, n, n_windows=6.0):
@@ -525,10 +601,18 @@ def hostile_events(rng, engine, n, n_windows=6.0):
 
 def make_count_event(rng):
     engine = read_engine(rng)
-    (event,) = hostile_events(rng, engine, 1)
-    values = int(event["x"]), int(event["y"]), int(event["p"]), int(event["t"])
     operator, state = parts_of(engine)
-    return *values, operator, state
+    (height, width), n_bins, limit = engine.resolution, len(state.counts), operator.max_count
+    x, y, p = int(rng.integers(0, width)), int(rng.integers(0, height)), int(rng.integers(0, 2))
+    place = int(pick(rng, [0, 0, 0, 1 - n_bins, 1 - n_bins, -n_bins, -n_bins - 5, 1, n_bins + 5]))
+    t = bin_start(engine, place) + int(pick(rng, [0, operator.bin_us - 1]))
+    state.counts[:, y // operator.downsample, x // operator.downsample] = pick(
+        rng, [-limit - 5, -limit - 1, -limit, 0, limit, limit + 1, limit + 5]
+    )
+    if rng.random() < 0.3:
+        values = [(width, y, p, t), (x, height, p, t), (x, y, -1, t), (x, y, 2, t)]
+        x, y, p, t = pick(rng, [*values, *((x, y, p, t) for t in (2**62, -(2**62), -(2**63), 2**63 - 1))])
+    return int(x), int(y), int(p), int(t), operator, state
 
 
 def make_is_valid(rng):
@@ -539,7 +623,13 @@ def make_is_valid(rng):
 def make_count_events(rng):
     engine = random_engine(rng)
     operator, state = parts_of(engine)
-    return hostile_events(rng, engine, 100), operator, state
+    events = hostile_events(rng, engine, 100)
+    if rng.random() < 0.3:  # most on one pixel and in one bin: counts go beyond the limit and come back
+        near = rng.random(len(events)) < 0.7
+        events["x"][near] = events["y"][near] = 0
+        events["t"][near] = bin_start(engine)
+        events["p"][near] = (np.arange(near.sum()) // 8 + rng.integers(0, 2)) % 2
+    return events, operator, state
 
 
 def lasso_problem(rng):
@@ -559,7 +649,8 @@ def frozen(array):
 def make_duality_gap(rng):
     right, square, gram, start = lasso_problem(rng)
     atoms = start.astype(np.float64)
-    return right - gram.astype(np.float64) @ atoms, right, atoms, square, 0.1
+    square *= pick(rng, [1.0, 1.0, 0.01])  # smaller than it can be, as rounding may make it
+    return right - gram.astype(np.float64) @ atoms, right, atoms, square, float(pick(rng, [0.1, 10.0]))
 
 
 LASSO_ROWS = 5
@@ -576,15 +667,19 @@ def with_response(gram, start):
 
 def make_solve_lasso(rng):
     right, square, gram, start = lasso_problem(rng)
-    penalty = float(pick(rng, [0.05, 0.5]))
+    penalty = float(pick(rng, [0.05, 0.5, 10.0]))
     work, *scratch = lasso_scratch(len(right))
+    if rng.random() < 0.2:  # the solution itself
+        start = naive._shrunken_gradient_steps(right, penalty, gram.astype(float), start.astype(float))
     return right, square, penalty, frozen(gram), 1e-8, with_response(gram, start), work[1:], *scratch
 
 
 def make_select_atoms(rng):
     right, _, gram, start = lasso_problem(rng)
     atoms, response = with_response(gram, start)
-    return right, atoms, response, float(pick(rng, [0.05, 0.5])), np.zeros(len(right), np.int64)
+    if rng.random() < 0.2:
+        atoms, response = np.zeros((2, len(right)))
+    return right, atoms, response, float(pick(rng, [0.05, 0.5, 10.0])), np.zeros(len(right), np.int64)
 
 
 def make_copy_corner(rng):
@@ -650,10 +745,17 @@ def random_row(rng, state):
 
 
 def make_encode_volume(rng):
-    operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    operator, state = parts_of(read_engine(rng))
     place = random_row(rng, state)
-    rows = (field[place].copy() for field in (state.projections, state.moments, state.atoms))
-    return *rows, bool(rng.random() < 0.5), random_part(rng, state), operator, state
+    projection, moments, atoms = (
+        field[place].copy() for field in (state.projections, state.moments, state.atoms)
+    )
+    if rng.random() < 0.2:
+        projection[:], moments[:] = 0, 0
+    atoms[:] = rng.normal(size=atoms.shape)
+    # A lasso that is solved again is for `lasso_code`: its code has no twin of the same bits.
+    fresh = bool(rng.random() < 0.5) and not (operator.inverse and moments[MOMENT_SQUARES])
+    return projection, moments, atoms, fresh, random_part(rng, state), operator, state
 
 
 def make_pool_volume(rng):
@@ -783,7 +885,7 @@ def make_read(rng):
 
 
 def engine_with_news(rng):
-    """An engine with events since its last reading, some planes of which are as if they were being filled."""
+    """An engine with events since its last emission, some planes of which are as if being filled."""
     operator, state = parts_of(read_engine(rng, more=40))
     for plane in range(len(state.cursors)):
         if rng.random() < 0.3:
@@ -791,8 +893,29 @@ def engine_with_news(rng):
     return operator, state
 
 
+def end_in_a_volume(rng, operator, state):
+    """Let a plane's cursors end within a volume that covers a changed entry, near that entry."""
+    plane, n_touched = int(rng.integers(0, len(state.cursors))), int(state.clock[CLOCK_TOUCHED])
+    if n_touched == 0:
+        return
+    slot, row, column = np.unravel_index(int(pick(rng, state.touched[:n_touched])), state.counts.shape)
+    rows, columns = range(*state.volume_rows[row]), range(*state.volume_columns[column])
+    if not (rows and columns):
+        return
+    r, c = int(pick(rng, rows)), int(pick(rng, columns))
+    position = (slot - state.clock[CLOCK_SLOT] - 1) % len(state.counts) - (plane != state.clock[CLOCK_PLANE])
+    inside = row - r * operator.stride, column - c * operator.stride
+    entry = int((position * operator.patch + inside[0]) * operator.patch + inside[1])
+    volume = r * int(state.volume_columns.max()) + c
+    end = int(pick(rng, [entry, entry + 1, rng.integers(1, len(operator.columns))]))
+    state.cursors[plane] = min(int(state.cursors[plane, CURSOR_CODED]), volume), volume, max(end, 1)
+
+
 def make_mark_dirty(rng):
-    return engine_with_news(rng)
+    *sensor, operator, state = engine_with_news(rng)
+    if rng.random() < 0.6:
+        end_in_a_volume(rng, operator, state)
+    return *sensor, operator, state
 
 
 def make_renew(rng):
@@ -822,9 +945,23 @@ def make_finish(rng):
     return int(rng.integers(1, len(state.code) + 1)), operator, state
 
 
+def near_the_end(rng, operator, state):
+    """Position, row and column of an entry where the plane ahead ends within a volume, or None."""
+    if len(state.cursors) == 1 or rng.random() < 0.2:
+        return None
+    _, volume, end = state.cursors[1 - int(state.clock[CLOCK_PLANE])].tolist()
+    if end == 0:
+        return None
+    area = operator.patch**2
+    position, inside = divmod(int(pick(rng, [end - 1, end])) % ((len(state.counts) - 1) * area), area)
+    top, left = (index * operator.stride for index in divmod(volume, int(state.volume_columns.max())))
+    return position + 1, top + inside // operator.patch, left + inside % operator.patch
+
+
 def changed_place(rng, operator, state):
     """Position, row and column of an entry whose clipped count is made another one."""
-    position, row, column = (int(rng.integers(0, side)) for side in state.counts.shape)
+    anywhere = tuple(int(rng.integers(0, side)) for side in state.counts.shape)
+    position, row, column = near_the_end(rng, operator, state) or anywhere
     entry = naive.slot_of(position, state), row, column
     state.counts[entry] = one_step(rng, int(state.applied[entry]), operator)
     return position, row, column
@@ -859,8 +996,11 @@ def make_move_volume(rng):
 
 def make_change_place(rng):
     operator, state = parts_of(read_engine(rng))
-    if len(state.cursors) > 1:
-        rewind(rng, 1 - int(state.clock[CLOCK_PLANE]), operator, state)
+    coming = 1 - int(state.clock[CLOCK_PLANE])
+    for _ in range(8 if len(state.cursors) > 1 else 0):
+        rewind(rng, coming, operator, state)
+        if state.cursors[coming, CURSOR_ENTRY]:
+            break
     return *changed_place(rng, operator, state), operator, state
 
 
@@ -972,16 +1112,17 @@ def _surface_events(rng, height, width, n):
 
 
 def make_add_memory_surfaces(rng):
-    height, width, cell, radius = rng.integers(3, 12, 4) // [1, 1, 1, 3]
+    height, width, cell = rng.integers(3, 12, 3)
+    radius = int(rng.integers(0, 4))
     rows, columns, side = -(-height // cell), -(-width // cell), 2 * radius + 1
-    events = _surface_events(rng, height, width, int(rng.integers(0, 60)))
+    events = _surface_events(rng, height, width, random_length(rng, 60))
     memory = rng.uniform(0, 2, (2, height, width))
     return *events, int(cell), memory, rng.uniform(0, 1, (rows, columns, 2, side, side))
 
 
 def make_time_surfaces(rng):
     height, width, side = int(rng.integers(1, 9)), int(rng.integers(1, 9)), 2 * int(rng.integers(0, 4)) + 1
-    events = _surface_events(rng, height, width, int(rng.integers(0, 60)))
+    events = _surface_events(rng, height, width, random_length(rng, 60))
     latest = np.full((2, height + side - 1, width + side - 1), -np.inf)
     return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
 
@@ -993,7 +1134,7 @@ def close_surfaces(kernel: Run, twin: Run) -> None:
 
 
 def make_mark_noise(rng):
-    height, width, n = int(rng.integers(1, 6)), int(rng.integers(1, 6)), int(rng.integers(0, 200))
+    height, width, n = int(rng.integers(1, 6)), int(rng.integers(1, 6)), random_length(rng, 200)
     events = np.zeros(n, EVENT_DTYPE)
     events["x"], events["y"] = rng.integers(0, width + 1, n), rng.integers(0, height + 1, n)
     events["p"] = rng.choice([0, 1, 0, 1, 0, 1, -1, 2], n)
@@ -1001,7 +1142,8 @@ def make_mark_noise(rng):
     events["t"] = np.cumsum(steps)
     if n:
         events["t"][rng.integers(0, n)] = rng.choice([1 << 62, -(1 << 62), (1 << 62) - 1, 1 - (1 << 62), 5])
-    limits = np.array([rng.choice([0, 1, 90_000, 600_000]), *rng.choice([0, 1, 30, 1_000], 2)], np.int64)
+    limits = np.array([rng.choice([0, 1, 90_000, 600_000]), *rng.choice([0, 1, 20, 300], 2)], np.int64)
+    limits *= rng.random() > 0.1
     past = np.where(rng.random((3, height, width)) < 0.5, BEFORE_TIME, rng.integers(-500, 500))
     level = rng.integers(0, 2 * denoise.HOT_LEVEL, (height, width))
     return events, limits, past.astype(np.int64), level, rng.integers(0, 9, 3), np.zeros(n, np.bool_)
@@ -1041,6 +1183,10 @@ KERNELS = [
     Row(decode.decode_mono, make_mono),
     Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
+    Row(file_codes.decode_event_stream, make_event_stream),
+    Row(file_codes.decode_ecf, make_ecf, exact_unless_refused),
+    Row(file_codes.decode_groups, make_groups, exact_unless_refused),
+    Row(file_codes.parse_rows, make_rows, exact_unless_refused),
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.is_valid, make_is_valid),
     Row(ingest.count_event, make_count_event),

@@ -1,6 +1,7 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
 import math
+import re
 
 import numpy as np
 
@@ -100,6 +101,139 @@ def time_span(events, height, width, span):
     if len(t):
         span[:] = t.min(), t.max()
     return len(t)
+
+
+# streamfeat.kernels.file_codes
+
+
+def decode_event_stream(data, is_atis, state, out):
+    t, crossings, _ = (int(v) for v in state)
+    data, at, events = data.tolist(), 0, []
+    bits = 6 if is_atis else 7
+    top = 2**bits - 1
+    while at < len(data):
+        time, rest = divmod(data[at], 2 ** (8 - bits))
+        if time == top:
+            t += top * rest
+            at += 1
+            continue
+        if len(data) - at < 5:
+            break
+        t += time
+        address = data[at + 1] + 256 * data[at + 2], data[at + 3] + 256 * data[at + 4]
+        if is_atis and rest % 2 == 1:
+            crossings += 1
+        else:
+            events.append((*address, rest // 2 if is_atis else rest, t))
+        at += 5
+    state[:] = t, crossings, at
+    return _write(events, out)
+
+
+def decode_ecf(data, size, out):
+    bytes_ = data.tolist()
+    at, n = 12, len(out)
+    t = int.from_bytes(bytes(bytes_[4:12]), "little", signed=True)
+    times = []
+    while len(times) < n:
+        if at >= size:
+            return -1 - at
+        step, run = divmod(bytes_[at], 16)
+        if step == 15:
+            nibbles = []
+            while bytes_[at] >= 0xF0 and len(nibbles) < 16:
+                nibbles.append(bytes_[at] % 16)
+                at += 1
+            t += sum(nibble << 4 * k for k, nibble in enumerate(nibbles))
+            continue
+        t += step
+        if run == 15:
+            run = bytes_[at + 1] + 256 * bytes_[at + 2]
+            at += 2
+        if run > n - len(times):
+            return -1 - at
+        times += run * [(t + 2**63) % 2**64 - 2**63]
+        at += 1
+    out["t"] = times
+    if bytes_[0] // 2 % 2:
+        return decode_groups(data, size, at, 24, out)
+    at = _ecf_runs(bytes_, size, at, 2, 5, out["y"])
+    if at < 0 or bytes_[0] % 2:
+        return at if at < 0 else decode_groups(data, size, at, 12, out)
+    columns = []
+    while len(columns) < n:
+        if at >= size:
+            return -1 - at
+        word = bytes_[at] + 256 * bytes_[at + 1]
+        columns += [word // 32] + [word // 32 + k for k in range(1, 6) if word % 32 & 2 ** (5 - k)]
+        at += 2
+    out["x"] = columns[:n]
+    at = _ecf_runs(bytes_, size, at, 1, 7, out["p"])
+    return -1 - at if at > size else at
+
+
+def _ecf_runs(data, size, at, width, bits, column):
+    values = []
+    while len(values) < len(column):
+        if at >= size:
+            return -1 - at
+        value, run = divmod(data[at] + (256 * data[at + 1] if width == 2 else 0), 2**bits)
+        if run == 2**bits - 1:
+            run = data[at + width] + 256 * data[at + width + 1]
+            at += 2
+        if run > len(column) - len(values):
+            return -1 - at
+        values += run * [value]
+        at += width
+    column[:] = values
+    return at
+
+
+def decode_groups(data, size, at, bits, out):
+    width = bits // 6
+    for i in range(0, len(out), 4):
+        if at + 3 * width > size:
+            return -1 - at
+        words = [int.from_bytes(data[at + k * width :][:width].tobytes(), "little") for k in range(3)]
+        digits = [f"{word:0{8 * width}b}" for word in words]
+        third = bits // 3
+        values = (
+            digits[0][:bits],
+            digits[1][: 2 * third] + digits[0][bits:],
+            digits[2][:third] + digits[1][2 * third :],
+            digits[2][third:],
+        )
+        for event, text in zip(out[i : i + 4], values, strict=False):
+            value = int(text, 2)
+            event["p"], event["x"] = value % 2, value // 2 % 2048
+            if bits == 24:
+                event["y"] = value // 4096 % 2048
+        at += 3 * width
+    return at
+
+
+def parse_rows(text, separator, wanted, digits, decimals):
+    n = 0
+    for line in bytes(text).split(b"\n"):
+        line = line.strip(b" \t")
+        if not line:
+            continue
+        if n == digits.shape[1]:
+            return -1
+        fields = re.split(re.escape(bytes([separator])) if separator else rb"[ \t]+", line)
+        if len(fields) <= max(wanted):
+            return -1
+        for k, i in enumerate(wanted):
+            number = re.fullmatch(rb"([+-]?)([0-9]*)(?:\.([0-9]*))?", fields[i].strip(b" \t"))
+            if number is None:
+                return -1
+            whole, behind = number[2], number[3] or b""
+            if not 1 <= len(whole + behind) <= 18 or (behind and int(whole + behind) >= 2**53):
+                return -1
+            digits[k, n] = int(number[1] + whole + behind)
+            decimals[k, n] = len(behind)
+        n += 1
+    return n
 
 
 def _write(events, out):
@@ -760,33 +894,66 @@ def features_from(codes, encoding, pooling=2):
 
 
 def mark_noise(events, limits, past, level, removed, keep):
-    rise, refractory, support = limits.tolist()
-    for i, (x, y, p, t) in enumerate(events.tolist()):
-        keep[i] = True
-        if not (x < level.shape[1] and y < level.shape[0] and p in (0, 1) and abs(t) < 1 << 62):
-            continue
-        hot_before, kept_before, _ = past[:, y, x].tolist()
-        if rise:
-            past[0, y, x] = t
-            left = max(int(level[y, x]) - max(t - hot_before, 0), 0)
-            level[y, x] = min(left + rise, 2_000_000)
-        if rise and level[y, x] > 1_000_000:
-            reason = 0
-        elif refractory and abs(t - kept_before) < refractory:
-            reason = 1
-        else:
-            reason = None
-            if refractory:
-                past[1, y, x] = t
-            if support:
-                around = past[2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].ravel().tolist()
-                around.remove(past[2, y, x])
-                past[2, y, x] = t
-                if not any(abs(t - other) <= support for other in around):
-                    reason = 2
-        if reason is not None:
-            keep[i] = False
-            removed[reason] += 1
+    """Three filters, one after the other: the first two know one pixel, the third its neighbours."""
+    height, width = level.shape
+    x, y, p, t = (events[name].astype(np.int64) for name in "xypt")
+    left = np.flatnonzero(
+        (x < width) & (y < height) & np.isin(p, (0, 1)) & (t > -(2**62)) & (t < 2**62)
+    ).tolist()
+    places = list(zip(y.tolist(), x.tolist(), strict=True))
+    keep[:] = True
+    for reason, noisy in enumerate((_hot, _too_soon, _alone)):
+        if limits[reason]:
+            noise = noisy(left, places, t.tolist(), int(limits[reason]), past[reason], level)
+            keep[noise] = False
+            removed[reason] += len(noise)
+            left = sorted({*left} - {*noise})
+
+
+def _by_pixel(left, places):
+    found = {}
+    for i in left:
+        found.setdefault(places[i], []).append(i)
+    return found.items()
+
+
+def _hot(left, places, t, rise, latest, level):
+    """A leaky bucket of two seconds for each pixel: full above one."""
+    noise = []
+    for place, events in _by_pixel(left, places):
+        bucket, before = int(level[place]), int(latest[place])
+        for i in events:
+            leaked = min(bucket, max(t[i] - before, 0))
+            bucket, before = min(bucket - leaked + rise, 2_000_000), t[i]
+            noise += [i] * (bucket > 1_000_000)
+        level[place], latest[place] = bucket, before
+    return noise
+
+
+def _too_soon(left, places, t, period, latest, level):
+    """Events less than a period away from the last one of their pixel that was not."""
+    noise = []
+    for place, events in _by_pixel(left, places):
+        passed = [int(latest[place])]
+        for i in events:
+            if -period < t[i] - passed[-1] < period:
+                noise.append(i)
+            else:
+                passed.append(t[i])
+        latest[place] = passed[-1]
+    return noise
+
+
+def _alone(left, places, t, support, latest, level):
+    """Events without a latest event of one of the eight pixels around that is near in time."""
+    noise = []
+    for i in left:
+        row, column = places[i]
+        around = np.pad(latest, 1, constant_values=np.iinfo(np.int64).min)[row : row + 3, column : column + 3]
+        others = np.delete(around.ravel(), 4).tolist()
+        noise += [i] * (min(abs(t[i] - other) for other in others) > support)
+        latest[row, column] = t[i]
+    return noise
 
 
 # streamfeat.kernels.surfaces

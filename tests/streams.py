@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 
 KINDS = [(f, e) for f in ("direct", "inverse") for e in ("soft", "split", "triangle")]
@@ -19,22 +19,6 @@ EXACT_KINDS = [kind for kind in KINDS if kind[0] == "direct" or kind[1] == "tria
 LASSO_KINDS = [kind for kind in KINDS if kind not in EXACT_KINDS]
 
 GAP = 1e-6
-
-
-def random_encoder(rng, geometry, n_filters, formulation="direct", encoding="soft", **parameters):
-    """An encoder like a learned one: filters of about unit length, whitening near the identity."""
-    d = geometry.entries
-    whitening = np.eye(d) + 0.2 / np.sqrt(d) * rng.normal(size=(d, d))
-    parameters = {"threshold": 0.1, "gap": GAP} | parameters
-    return Encoder.build(
-        geometry,
-        formulation=formulation,
-        encoding=encoding,
-        filters=rng.normal(size=(n_filters, d)) / np.sqrt(d),
-        whitening=(whitening + whitening.T) / 2,
-        mean=0.1 * rng.normal(size=d),
-        **parameters,
-    )
 
 
 @dataclass(frozen=True)
@@ -164,6 +148,14 @@ def fed_in_every_way(make_engine, events, rng):
             told_the_time.advance(latest - int(rng.integers(0, 3)))
             told_the_time.advance(latest)
     yield "told the time after each event", told_the_time
+
+    prepared = make_engine(look_ahead=True)
+    end = 0
+    while end < len(events):  # so little that most pieces end within a volume
+        start, end = end, end + int(rng.integers(1, 4))
+        prepared.feed(events[start:end])
+        prepared.prepare(int(rng.integers(1, 13)))
+    yield "prepared in small pieces", prepared
 
     for look_ahead in (False, True):
         how = ", looking ahead" if look_ahead else ""

@@ -10,6 +10,7 @@ from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from streamfeat.errors import InputError
+from streamfeat.learn import chunks
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
 from streamfeat.learn.transform import TransformLearner
@@ -141,6 +142,27 @@ def test_no_float_copy_of_all_volumes_is_made(learner):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < n * d * 4 / 2
+
+
+def test_few_volumes_are_whitened_once_and_many_on_every_pass(monkeypatch):
+    counts = np.random.default_rng(0).integers(-1, 2, (600, 24)).astype(np.int8)
+    whitener = VolumeWhitener().fit(counts)
+    calls = []
+
+    def make(rows):
+        calls.append(len(rows))
+        return whitener.transform(rows)
+
+    def learned():
+        calls.clear()
+        volumes = ChunkedVolumes(counts, 200).made(make)
+        return TransformLearner(12, max_iter=3, random_state=0).fit(volumes).components_
+
+    kept = learned()
+    assert calls == [200, 200, 200]
+    monkeypatch.setattr(chunks, "_KEPT", 4 * counts.size - 1)
+    assert np.array_equal(learned(), kept)
+    assert len(calls) > 3 * 3
 
 
 BAD_VOLUMES = {

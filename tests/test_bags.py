@@ -177,6 +177,21 @@ class TestBadBags:
         assert len(found) >= 1_500
         assert recording.losses
 
+    @pytest.mark.parametrize("keep", [0, 100, 0.5])
+    @pytest.mark.parametrize("options", KINDS.values(), ids=KINDS)
+    def test_a_cut_middle_file_is_named_and_counted(self, tmp_path, options, keep):
+        folder = write_split(tmp_path / "bag", 4, **options)
+        middle = sorted(folder.glob("bag_*"))[1]
+        whole = middle.read_bytes()
+        middle.write_bytes(whole[: int(keep * len(whole)) if keep < 1 else keep])
+        found, recording = read(folder)
+        assert 1_500 <= len(found) < 2_000
+        np.testing.assert_array_equal(np.unique(found), np.unique(found[np.isin(found["t"], events()["t"])]))
+        assert sum(recording.losses.counts.values()) == (2_000 - len(found)) // 100
+        first = next(iter(recording.losses.first.values()))
+        assert middle.name in first
+        assert "streamfeat-" not in first  # where it was unpacked for the while
+
     def test_a_middle_file_of_rubbish_or_none(self, tmp_path):
         folder = write_split(tmp_path / "bag", 4)
         (folder / "bag_2.mcap").write_bytes(b"")
@@ -266,14 +281,17 @@ class TestBadBags:
 
 
 class TestRos1:
-    def write(self, path):
+    def write(self, path, compression=None, encoding="mono"):
         rosbag1 = pytest.importorskip("rosbags.rosbag1")
         store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
         store.register(typesys.get_types_from_msg(EventPacket.SCHEMA.partition("=" * 20)[0], TYPE))
         header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-        with rosbag1.Writer(path) as writer:
+        writer = rosbag1.Writer(path)
+        if compression:
+            writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+        with writer:
             connection = writer.add_connection(TOPIC, TYPE, typestore=store)
-            for n, m in enumerate(packets()):
+            for n, m in enumerate(packets(encoding=encoding)):
                 time = stamp(m.stamp_ns // 10**9, m.stamp_ns % 10**9)
                 message = store.types[TYPE](
                     header(n, time, ""), m.height, m.width, m.seq, m.time_base, m.encoding, m.is_bigendian,
@@ -284,6 +302,13 @@ class TestRos1:
 
     def test_a_bag_is_a_recording(self, tmp_path):
         found, recording = read(self.write(tmp_path / "a.bag"))
+        np.testing.assert_array_equal(found, events())
+        assert not recording.losses
+
+    @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+    @pytest.mark.parametrize("encoding", ["mono", "evt3"])
+    def test_whatever_its_chunks_are_packed_with(self, tmp_path, compression, encoding):
+        found, recording = read(self.write(tmp_path / "a.bag", compression, encoding))
         np.testing.assert_array_equal(found, events())
         assert not recording.losses
 

@@ -1,14 +1,19 @@
 """Camera files as people have them: orders, names, units, layouts, streams; each says what was assumed."""
 
+import bz2
+import gzip
+
 import camera_files_scene as scenes
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import streamfeat as sf
 from streamfeat.camera_files.event_files import open_events, read_events
 from streamfeat.camera_files.source import TableOptions
 from streamfeat.errors import InputError
+from streamfeat.events import make_events
 
 SCENE = scenes.scene()
 NAMES = {"x": ["x", "X", "x@64", "xs"], "y": ["y", "Y", "y@48", "ys"], "p": ["p", "pol", "on", "Polarity"]}
@@ -92,6 +97,77 @@ def test_words_index_columns_and_sizes(tmp_path):
         assert open_events(path).declared == (48, 64)
 
 
+FORMS = {
+    "a.tsv": ("t\tx\ty\tp", "{t}\t{x}\t{y}\t{p}"),
+    "no_ending": ("", "{t} {x} {y} {p}"),
+    "spaces.txt": ("", "  {t:10d}   {x:4d} {y:4d}  {p}   "),
+    "pipe.csv": ("t|x|y|p", "{t}|{x}|{y}|{p}"),
+    "decimal_commas.csv": ("t;x;y;p", "{seconds};{x};{y};{p}"),
+    "decimal_commas_and_tabs.txt": ("", "{seconds}\t{x}\t{y}\t{p}"),
+    "comma_and_space.txt": ("", "{t}, {x}, {y}, {p}"),
+    "trailing_comma.csv": ("", "{t},{x},{y},{p},"),
+    "all_quoted.csv": ('"t","x","y","p"', '"{t}","{x}","{y}","{p}"'),
+    "signed.csv": ("t,x,y,p", "{t},{x},{y},{signed:+d}"),
+    "on_off.txt": ("", "{t} {x} {y} {on}"),
+    "positive.csv": ("t,x,y,p", "{t},{x},{y},{positive}"),
+    "scientific.txt": ("", "{t:.9e} {x:.3e} {y:.3e} {p:.3e}"),
+    "notes.txt": ("# made by hand", "{t} {x} {y} {p} # seen"),
+    "classic_mac.csv": ("t,x,y,p\r", "{t},{x},{y},{p}\r"),
+    "rows_and_columns.csv": ("timestamp,row,col,polarity", "{t},{y},{x},{p}"),
+    "camel.csv": ("timestampUs,xCoord,yCoord,isOn", "{t},{x},{y},{p}"),
+    "prefixes.csv": ("t_ns,pixel_x,pixel_y,event_p", "{t}000,{x},{y},{p}"),
+    "unit_alone.csv": ("x,y,pol,micros", "{x},{y},{p},{t}"),
+    "other_columns.csv": ("id,t,x,y,p,label", "7,{t},{x},{y},{p},car"),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_tables_as_people_write_them(tmp_path, name):
+    header, row = FORMS[name]
+    rows = [header] if header else []
+    for t, x, y, p in zip(*(SCENE[field].tolist() for field in "txyp"), strict=True):
+        words = {"on": "ON" if p else "OFF", "positive": "positive" if p else "negative", "signed": 2 * p - 1}
+        rows.append(row.format(t=t, x=x, y=y, p=p, seconds=f"{t / 1e6:.6f}".replace(".", ","), **words))
+    end = "" if name == "classic_mac.csv" else "\n"
+    np.testing.assert_array_equal(
+        read(tmp_path / name, "".join(f"{row}{end}" for row in rows).encode()), SCENE
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.decimals(0, 2_000_000_000, places=9).map(str)
+        | st.from_regex(r"[0-9]{1,9}\.[0-9]{0,8}", fullmatch=True),
+        min_size=1,
+        max_size=30,
+    ),
+    st.sampled_from([",", ";", " ", "\t", " ; "]),
+)
+def test_seconds_are_the_nearest_microseconds_of_the_floats_they_are(folder, times, separator):
+    times.sort(key=float)
+    data = "".join(separator.join([t, "3", "4", "1"]) + "\n" for t in times)
+    events = read(folder / "seconds.txt", data.encode(), columns="t,x,y,p", time_unit="s")
+    assert events["t"].tolist() == [int(np.rint(float(t) * 1e6)) for t in times]
+
+
+def test_plain_numbers_and_others_in_one_file(tmp_path):
+    """Blocks of plain numbers take another way than those with exponents, words or damage."""
+    rows = [f"{t},3,4,1" for t in range(400_000)]
+    rows[300_000] = "3e5,3,4,1"
+    rows.insert(200_000, "# again")
+    events = read(tmp_path / "a.csv", "\n".join(["t,x,y,p", *rows]).encode())
+    assert events["t"].tolist() == [*range(400_000)]
+    rows[350_000] = "350000,3,oh,1"
+    with pytest.raises(InputError, match="could not convert string 'oh'"):
+        read(tmp_path / "a.csv", "\n".join(["t,x,y,p", *rows]).encode())
+
+
+def test_seconds_and_their_rest_in_columns_of_their_own_are_refused(tmp_path):
+    with pytest.raises(InputError, match="sec,usec,x,y,p lack one of"):
+        read(tmp_path / "a.csv", b"sec,usec,x,y,p\n1,5,2,3,1\n")
+
+
 def test_two_conventions_of_off_in_one_file_are_refused(tmp_path):
     with pytest.raises(InputError, match="one of them is OFF"):
         read(tmp_path / "a.txt", b"10 1 2 1\n20 1 2 0\n30 1 2 -1\n")
@@ -104,6 +180,31 @@ def test_arrays_under_other_names_and_with_labels(tmp_path):
     np.savez(tmp_path / "b.npz", **names)
     for name in ("a.npz", "b.npz"):
         np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
+
+
+@pytest.mark.parametrize(
+    ("make", "ending"),
+    [
+        (lambda: scenes.table(SCENE, "txyp").T, "npy"),
+        (lambda: scenes.table(SCENE, "xytp").astype(">i4"), "npy"),
+        (lambda: scenes.table(SCENE, "txyp").astype("f4"), "npy"),
+        (lambda: SCENE.astype([("x", ">u2"), ("y", ">u2"), ("p", "?"), ("t", ">i8")])[:, None], "npy"),
+        (lambda: {"arr_0": SCENE.astype([("x", "u1"), ("y", "u1"), ("p", "i1"), ("t", "<u4")])}, "npz"),
+        (lambda: {**columns(), "t": SCENE["t"].astype("datetime64[us]")}, "npz"),
+        (lambda: {**columns(), "t": SCENE["t"].astype("timedelta64[us]").astype("m8[ns]")}, "npz"),
+        (lambda: {"t": SCENE["t"], "p": SCENE["p"], "xy": np.stack([SCENE["x"], SCENE["y"]], 1)}, "npz"),
+        (lambda: {f"{name}s": column[:, None] for name, column in columns().items()}, "npz"),
+        (lambda: {**columns(), "about": np.array({"a": 1}, dtype=object)}, "npz"),
+    ],
+)
+def test_arrays_as_people_keep_them(tmp_path, make, ending):
+    made = make()
+    np.savez(tmp_path / "a.npz", **made) if ending == "npz" else np.save(tmp_path / "a.npy", made)
+    np.testing.assert_array_equal(read_events(tmp_path / f"a.{ending}").events, SCENE)
+
+
+def columns():
+    return {name: SCENE[name] for name in "xypt"}
 
 
 def test_a_small_file_that_unpacks_to_much_is_refused(tmp_path):
@@ -143,6 +244,97 @@ def test_dat_goes_on_when_its_32_bits_wrap(tmp_path):
 def test_aedat_2_and_3(tmp_path):
     for data in (scenes.aedat2(SCENE), scenes.aedat2(SCENE, "Davis346red"), scenes.aedat3(SCENE)):
         np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), SCENE)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (scenes.aedat2(SCENE), "2.0 addresses of a DVS128, as they stand, because the header names no chip"),
+        (scenes.aedat2(SCENE, "DVS128"), "ON where bit 0 is clear, as jAER has it"),
+        (scenes.aedat1(SCENE), "1.0 addresses of a DVS128, as they stand"),
+        (scenes.aedat1(SCENE, b"# made by hand\r\n"), "it names no version"),
+        (scenes.aedat1(SCENE, b""), "it names no version"),
+        (
+            scenes.aedat1(SCENE, b"#!AER-DAT1.0\r\n# AEChip: ch.unizh.ini.jaer.DVS128\r\n", is_turned=True),
+            "x is mirrored, y from the bottom",
+        ),
+    ],
+)
+def test_a_dvs128_is_turned_where_it_is_named_and_that_is_said(tmp_path, data, said):
+    np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), SCENE)
+    file = open_events(tmp_path / "a.aedat")
+    assert any(said in line for line in file.assumptions)
+    assert file.declared == (128, 128)
+
+
+def test_an_address_that_begins_like_a_header_line_is_no_header(tmp_path):
+    rows = make_events([5] * 90, [0x23] * 90, [1] * 90, range(10, 100))  # 10 is the end of a line
+    for data in (scenes.aedat1(rows), scenes.aedat1(rows, b"")):
+        np.testing.assert_array_equal(read(tmp_path / "a.aedat", data), rows)
+
+
+def test_aedat_1_that_is_something_else_is_refused(tmp_path):
+    garbage = np.random.default_rng(1).bytes(6_000)
+    with pytest.raises(InputError, match="time goes back"):
+        read(tmp_path / "a.aedat", garbage)
+    with pytest.raises(InputError, match="hold none of a davis346"):
+        read(tmp_path / "a.aedat", b"#!AER-DAT1.0\r\n# AEChip: x.Davis346red\r\n")
+
+
+class TestEventStream:
+    @pytest.mark.parametrize("is_atis", [False, True])
+    def test_events_of_both_kinds_in_blocks(self, tmp_path, is_atis):
+        n = 230_000  # more than one block
+        rng = np.random.default_rng(2)
+        t = np.cumsum(rng.choice([0, 1, 62, 63, 126, 127, 128, 400], n))
+        events = make_events(rng.integers(0, 64, n), rng.integers(0, 48, n), rng.integers(0, 2, n), t)
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(events, is_atis=is_atis))
+        batches = [*open_events(tmp_path / "a.es")]
+        assert len(batches) > 1
+        np.testing.assert_array_equal(np.concatenate(batches), events)
+        assert open_events(tmp_path / "a.es").declared == (48, 64)
+
+    def test_an_event_cut_in_two_is_counted(self, tmp_path):
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(SCENE)[:-2])
+        cut = read_events(tmp_path / "a.es")
+        np.testing.assert_array_equal(cut.events, SCENE[:-1])
+        assert cut.lost_bytes == 3
+
+    @pytest.mark.parametrize(
+        ("change", "match"),
+        [
+            (lambda data: data[:17], "17 of 20 bytes"),
+            (lambda data: data[:12] + b"\x01" + data[13:], r"version 1\.0\.0; only 2"),
+            (lambda data: data[:15] + b"\x00" + data[16:], "holds generic events"),
+            (lambda data: data[:15] + b"\x63" + data[16:], "events of kind 99"),
+            (lambda data: data[:16] + bytes(4) + data[20:], "0 x 0 pixels"),
+        ],
+    )
+    def test_headers_that_cannot_be_used(self, tmp_path, change, match):
+        with pytest.raises(InputError, match=match):
+            read(tmp_path / "a.es", change(scenes.event_stream(SCENE)))
+
+    def test_an_event_outside_the_sensor_is_counted(self, tmp_path):
+        data = scenes.event_stream(SCENE)
+        (tmp_path / "a.es").write_bytes(
+            data[:18] + b"\x17\x00" + data[20:]
+        )  # 23 rows: the upper 25 are not there
+        read = read_events(tmp_path / "a.es")
+        lower = SCENE[SCENE["y"] >= 25]
+        np.testing.assert_array_equal(read.events["y"], lower["y"] - 25)
+        np.testing.assert_array_equal(read.events["t"], lower["t"])
+        assert read.damage == (f"{len(SCENE) - len(lower)} events outside 64x23 left out",)
+
+    def test_faery_reads_and_writes_the_same(self, tmp_path):
+        faery = pytest.importorskip("faery")
+        (tmp_path / "a.es").write_bytes(scenes.event_stream(SCENE))
+        theirs = np.concatenate([*faery.events_stream_from_file(tmp_path / "a.es")])
+        for mine, field in zip("xypt", ("x", "y", "on", "t"), strict=True):
+            np.testing.assert_array_equal(theirs[field], SCENE[mine])
+        faery.events_stream_from_array(theirs, (64, 48)).to_file(tmp_path / "b.es")
+        again = read_events(tmp_path / "b.es").events
+        again["t"] += SCENE["t"][0]  # it writes times from 0
+        np.testing.assert_array_equal(again, SCENE)
 
 
 def test_aedat_3_cut_short_keeps_what_came_before(tmp_path):
@@ -188,6 +380,49 @@ class TestHdf5:
             np.testing.assert_array_equal(read_events(tmp_path / name).events, SCENE)
         assert "davis/right/events" in open_events(tmp_path / "mvsec.h5").assumptions[0]
 
+    @pytest.mark.parametrize("layout", ["rvt", "m3ed", "columns", "big endian"])
+    def test_other_layouts(self, tmp_path, h5py, layout):
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            if layout == "m3ed":
+                root["prophesee/left/calib/resolution"], root["prophesee/left/ms_map_idx"] = [64, 48], [0, 20]
+            elif layout == "rvt":
+                root["events/ms_to_idx"], root["events/t_offset"] = np.arange(31) * 20, 0
+            folder = "prophesee/left" if layout == "m3ed" else "events"
+            for name, column in columns().items():
+                column = column.astype("?") if name == "p" else column
+                column = column.astype(">i8") if layout == "big endian" else column
+                root[f"{folder}/{name}"] = column[:, None] if layout == "columns" else column
+        np.testing.assert_array_equal(read_events(tmp_path / "a.h5").events, SCENE)
+
+    @pytest.mark.parametrize("mode", [0, 1, 2])
+    def test_ecf_of_prophesee_in_every_packing(self, tmp_path, h5py, mode):
+        path = scenes.ecf_file(
+            h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[i : i + 250], mode) for i in (0, 250)]
+        )
+        file = open_events(path)
+        np.testing.assert_array_equal(np.concatenate([*file]), SCENE[:500])
+        assert (file.declared, file.damage, len([*file])) == ((48, 64), [], 2)
+
+    def test_the_last_chunk_of_ecf_holds_more_than_the_table(self, tmp_path, h5py):
+        padded = np.concatenate([SCENE[250:400], np.zeros(100, SCENE.dtype)])  # as the HDF5 library writes it
+        chunks = [scenes.ecf(SCENE[:250], 2), scenes.ecf(padded, 2)]
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", chunks, n=400)
+        np.testing.assert_array_equal(read_events(path).events, SCENE[:400])
+
+    @pytest.mark.parametrize("cut", [4, 11, 12, 300, 700])
+    def test_ecf_that_is_cut_short_keeps_the_chunks_before(self, tmp_path, h5py, cut):
+        chunks = [scenes.ecf(SCENE[:250], 1), scenes.ecf(SCENE[250:500], 1)[:cut]]
+        cut_short = read_events(scenes.ecf_file(h5py, tmp_path / "a.h5", chunks))
+        np.testing.assert_array_equal(cut_short.events, SCENE[:250])
+        assert "after event 250 is lost: a chunk of ECF" in cut_short.damage[0]
+        with pytest.raises(InputError, match="damaged: a chunk of ECF"):
+            open_events(scenes.ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
+
+    def test_ecf_together_with_another_filter_is_refused(self, tmp_path, h5py):
+        path = scenes.ecf_file(h5py, tmp_path / "a.h5", [scenes.ecf(SCENE[:250], 1)], is_shuffled=True)
+        with pytest.raises(InputError, match="with this filter alone"):
+            open_events(path)
+
     def test_half_of_the_tables(self, tmp_path, h5py):
         with h5py.File(tmp_path / "a.h5", "w") as root:
             root["events/x"], root["events/y"] = SCENE["x"], SCENE["y"]
@@ -202,3 +437,23 @@ class TestHdf5:
             open_events(tmp_path / "a.h5")
         file = open_events(tmp_path / "a.h5", options=TableOptions(stream="two/events"))
         np.testing.assert_array_equal(np.concatenate([*file]), SCENE)
+
+
+@pytest.mark.parametrize(("ending", "pack"), [("gz", gzip.compress), ("bz2", bz2.compress)])
+def test_packed_files_are_unpacked_for_the_while_and_damage_is_counted(tmp_path, ending, pack):
+    packed = pack(scenes.text(SCENE, "txyp", ",", "t,x,y,p\n"))
+    path = tmp_path / f"a.csv.{ending}"
+    path.write_bytes(packed)
+    with sf.open_recording(path) as recording:
+        np.testing.assert_array_equal(np.concatenate([*recording]), SCENE)
+        assert not recording.losses
+        assert all(str(path) in line for line in recording.assumptions)
+    if ending == "gz":
+        path.write_bytes(packed[:-300])
+        with sf.open_recording(path) as recording:
+            events = np.concatenate([*recording])
+            np.testing.assert_array_equal(events, SCENE[: len(events)])
+            assert "cannot be unpacked after its byte" in recording.losses.first["damaged file"]
+    path.write_bytes(packed[:3])
+    with pytest.raises(InputError, match="nothing in it can be unpacked"):
+        sf.open_recording(path)

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from live_net import free_port, until
 
 from streamfeat.classify.features import encode_recordings
+from streamfeat.classify.variants import Variant
 from streamfeat.convert import datasets
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
@@ -52,7 +53,7 @@ def learned(workers, formulation="direct", report=lambda *step: None):
         assert len(recording.parts()) > 1
         setting = Setting(formulation=formulation, **SMALL)
         encoder = learn_encoder([recording], setting, report=report, workers=workers)
-        samples = encode_recordings(encoder, [recording], mirror=True, workers=workers)
+        samples = encode_recordings(encoder, [recording], variant=Variant(mirror=True), workers=workers)
     return (
         encoder.fingerprint,
         encoder.provenance["objective"],

@@ -274,3 +274,13 @@ def test_any_bytes_decode_or_are_refused(encoding, payload, time_base_ns):
     assert events.dtype == EVENT_DTYPE
     assert len(events) <= 6 * len(payload)
     assert set(np.unique(events["p"])) <= {0, 1}
+
+
+@pytest.mark.parametrize("encoding", PAYLOAD_ENCODINGS)
+def test_a_snapshot_of_another_length_is_refused_and_changes_nothing(encoding):
+    decoder = make_decoder(encoding)
+    good = decoder.snapshot()
+    for bad in [*([0] * n for n in range(len(good))), [*good, 0], [*good, *good, 1]]:
+        with pytest.raises(InputError, match="snapshot of a decoder holds"):
+            decoder.restore(bad)
+        assert decoder.snapshot() == good

@@ -14,7 +14,9 @@ from streamfeat.convert.splits import SamplePath, hold_out_block, parse_hold_out
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
+from streamfeat.messages.packets import PacketWriter
 from streamfeat.recordings.reader import Label, Sample, open_recording
+from streamfeat.recordings.writer import RecordingWriter
 
 NCARS_HEADER = b"% Data file containing N9Chronocam7Event2dE events.\n% Version 2\n\x00\x08"
 
@@ -282,3 +284,62 @@ def test_real_nmnist_event_for_event(shared_data, tmp_path):
         for field in "xyp":
             np.testing.assert_array_equal(sample.events[field], source[field])
         np.testing.assert_array_equal(sample.events["t"] - sample.label.start_us, source["t"])
+
+
+class TestRecordingsAsSamples:
+    """Samples may be MCAP files and bags as well."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        from test_bags import write_bag
+
+        self.events = {}
+        for i, (split, label) in enumerate([("train", "a"), ("train", "b"), ("test", "a")]):
+            place = tmp_path / "set" / split / label
+            place.mkdir(parents=True)
+            for kind in ("one.mcap", "two.dat", "bag"):
+                events = sample_events(10 * i + len(kind), width=16)
+                events["y"] %= 12
+                self.events[f"{split}/{label}/{kind}"] = events
+                if kind == "bag":
+                    messages = list(PacketWriter().messages(events, (12, 16)))
+                    write_bag(place / kind, storage="sqlite3" if i else "mcap", messages=messages)
+                elif kind == "one.mcap":
+                    with RecordingWriter(place / kind) as writer:
+                        writer.write_events(events, (12, 16))
+                else:
+                    put(place / kind, dat_bytes(events, b"% Width 16\n% Height 12\n% Version 2\n\x00\x08"))
+        return tmp_path / "set"
+
+    def test_each_is_one_sample(self, folder, tmp_path):
+        done = convert(folder, tmp_path / "o.mcap")
+        assert (done.samples, done.failed, done.damaged) == (9, [], [])
+        for sample in samples_of(tmp_path / "o.mcap"):
+            split, label, _ = sample.label.source.split("/")
+            assert (sample.label.split, sample.label.label, sample.resolution) == (split, label, (12, 16))
+            wanted = self.events[sample.label.source].copy()
+            wanted["t"] += sample.label.start_us - wanted["t"][0]
+            np.testing.assert_array_equal(sample.events, wanted)
+
+    def test_one_that_cannot_be_read_is_named(self, folder, tmp_path):
+        (folder / "train/a/one.mcap").write_bytes(b"")
+        for file in (folder / "train/b/bag").glob("*.db3"):
+            file.unlink()
+        done = convert(folder, tmp_path / "o.mcap")
+        assert done.samples == 7
+        assert sorted(str(path.relative_to(folder)) for path, _ in done.failed) == [
+            "train/a/one.mcap", "train/b/bag",
+        ]  # fmt: skip
+
+    def test_a_clock_that_starts_anew_ends_the_sample_and_is_said(self, folder, tmp_path):
+        from test_timeline import messages, moving_dot, store
+
+        made = messages(moving_dot(400, 5_000_000)) + messages(moving_dot(200, 0), host_us=900_000)
+        (folder / "train/a/one.mcap").unlink()
+        store(folder / "train/a/one.mcap", made)
+        done = convert(folder, tmp_path / "o.mcap")
+        ((path, why),) = done.damaged
+        assert path.name == "one.mcap"
+        assert "the 200 events after that are left out" in why
+        first = next(s for s in samples_of(tmp_path / "o.mcap") if s.label.source == "train/a/one.mcap")
+        assert len(first.events) == 400

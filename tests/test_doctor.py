@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from test_json import check
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -31,6 +32,7 @@ def test_a_sound_installation(requirements):
     requirements(*REAL)
     result = run("--json")
     found = json.loads(result.stdout)
+    check("doctor", found)
     assert (result.exit_code, found["problems"]) == (0, [])
     assert found["exact"] is True
     assert {"numpy", "numba", "mcap"} <= set(found["required"])
@@ -38,12 +40,14 @@ def test_a_sound_installation(requirements):
     assert set(doctor.EXTRAS) >= set(found["extras"])
     assert found["threads"]["layer"] in {"tbb", "omp", "workqueue"}
     assert set(found["vectors"]) <= set(found["cpu_features"])
+    assert found["kernels"]["digest"] in found["kernels"]["folder"]
     assert found["speed"]["events_per_s"] > 0
     assert found["speed"]["event_us"] > 0
     table = run()
     assert table.exit_code == 0
     assert "all is well" in table.stdout
     assert found["machine"]["python"] in table.stdout
+    assert found["kernels"]["digest"] in table.stdout
 
 
 def test_a_missing_extra_is_no_problem(requirements):
@@ -74,7 +78,7 @@ def test_a_missing_or_outdated_requirement_is_a_problem(requirements, line, says
 
 def test_kernels_that_cannot_be_kept_are_a_problem(requirements, monkeypatch):
     requirements("numpy>=2")
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(doctor.cache, "folder", lambda: None)
     result = run("--json")
     assert result.exit_code == 1
     assert "set NUMBA_CACHE_DIR" in json.loads(result.stdout)["problems"][0]

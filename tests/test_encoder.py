@@ -16,7 +16,6 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import with_fixed_point
 from streamfeat.errors import InputError
 from streamfeat.files import safetensors_file as safe_arrays
-from streamfeat.files.atomic import replacing, write_atomically
 from streamfeat.kernels.layout import TRIANGLE
 
 ids = "-".join
@@ -525,25 +524,6 @@ def test_what_no_json_can_hold_leaves_the_earlier_model(saved):
         known_encoder(provenance={"when": object()}).save(saved)
     assert saved.read_bytes() == before
     assert only(saved.parent) == [saved.name]
-
-
-def test_a_block_that_fails_leaves_nothing(tmp_path):
-    target = tmp_path / "file"
-    target.write_text("before")
-
-    def write_half():
-        with replacing(target) as temporary:
-            temporary.write_text("half of it")
-            assert target.read_text() == "before"
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        write_half()
-    assert target.read_text() == "before"
-    assert only(tmp_path) == ["file"]
-    write_atomically(target, b"after")
-    assert target.read_bytes() == b"after"
-    assert only(tmp_path) == ["file"]
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path):

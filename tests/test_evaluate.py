@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -170,6 +171,8 @@ def test_on_train_what_is_held_out_is_not_there(animals, tmp_path):
 
 def test_of_a_packet_only_the_events_of_a_held_out_sample_are_left_out(tmp_path):
     events = tiny.steady(0, 30_000, 90)
+    events["t"][[30, 60]] = 10_000, 20_000  # the first that is left out, and the first that is not
+    events.sort(order="t")
     items = [
         Label(0, 10_000, "cat", "train"),
         Label(10_000, 10_000, "dog", "test"),
@@ -213,7 +216,8 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    assert counts.key == {"method": "counts", "setting": {"mirror": False, "kernel": "linear"}, "fold": 0}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear"}
+    assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 
 @pytest.mark.parametrize(
@@ -489,30 +493,35 @@ CELL = Cell("direct", Trial(), 0)
 RESULT = {"hits": "11100", "samples": [4, 5], "confusion": [[1]]}
 
 
+def keep(path):
+    with closing(StateFile(path, HEADER)) as state:
+        state.add(CELL, RESULT)
+
+
 def test_a_cell_is_kept_and_found_again(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER).add(CELL, RESULT)
-    again = StateFile(path, HEADER)
-    assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
-    assert again.get(replace(CELL, fold=1)) is None
-    assert again.get(replace(CELL, setting=Trial(bins=4))) is None
+    keep(path)
+    with closing(StateFile(path, HEADER)) as again:
+        assert again.get(replace(CELL, swept="bins")) == RESULT  # the same setting, asked for by a sweep
+        assert again.get(replace(CELL, fold=1)) is None
+        assert again.get(replace(CELL, setting=Trial(bins=4))) is None
 
 
 def test_a_line_that_was_being_written_is_dropped(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER).add(CELL, RESULT)
+    keep(path)
     whole = path.read_bytes()
     for cut in range(1, len(whole), 41):
         path.write_bytes(whole[:cut])
-        state = StateFile(path, HEADER)
-        assert len(state) == 0
-        state.add(CELL, RESULT)
+        with closing(StateFile(path, HEADER)) as state:
+            assert len(state) == 0
+            state.add(CELL, RESULT)
         assert path.read_bytes() == whole
 
 
 def test_the_state_of_another_run_is_refused(tmp_path):
     path = tmp_path / "state.part"
-    StateFile(path, HEADER)
+    StateFile(path, HEADER).close()
     with pytest.raises(InputError, match="of a run with other recordings"):
         StateFile(path, {**HEADER, "version": 2})
     path.write_bytes(json.dumps(HEADER).encode() + b'\n{"cell": 1}\n')

@@ -14,10 +14,8 @@ from sklearn.utils.validation import check_is_fitted
 
 import streamfeat as sf
 from streamfeat.classify.classifier import normalise_features
-from streamfeat.classify.features import encode_recordings, mirrored, training_set
 from streamfeat.classify.svm import LinearSVM
 from streamfeat.errors import InputError
-from streamfeat.recordings.reader import Label, Sample, open_recording
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 
@@ -130,40 +128,3 @@ def test_event_arrays_have_the_features_of_the_offline_path(digits):
     assert np.array_equal(mixed[1], step.transform([test[1]])[0])
     assert step.transform([]).shape == (0, encoder.n_features)
     assert clone(step).resolution == (34, 34)
-
-
-def test_a_mirror_image_swaps_left_and_right():
-    events = tiny.stream(range(40))
-    events["x"][:3] = 0, 15, 16  # the last is outside
-    sample = Sample(Label(0, 100, "cat"), events, tiny.RESOLUTION)
-    image = mirrored(sample)
-    assert image.events["x"][:2].tolist() == [15, 0]
-    assert image.events["x"][2] >= 16
-    for name in ("y", "p", "t"):
-        np.testing.assert_array_equal(image.events[name], events[name])
-    np.testing.assert_array_equal(mirrored(image).events, events)
-    assert events["x"][1] == 15  # the sample itself is as it was
-
-
-def test_mirror_images_are_those_of_training_samples(tmp_path):
-    model = tiny.encoder()
-    path = tiny.write_digits(tmp_path / "digits.mcap", 8, n_held_out=3)
-    with open_recording(path) as recording:
-        every = list(recording.samples())
-        samples = encode_recordings(model, [recording])
-        images = encode_recordings(model, [recording], mirror=True)
-    assert samples.held_out.tolist() == [True] * 3 + [False] * 5
-    seen = every[3:]
-    for row, sample in zip(images.rows, map(mirrored, seen), strict=True):
-        expected = model.encode(
-            sample.events,
-            sample.resolution,
-            origin_us=sample.label.start_us,
-            t_us=sample.label.start_us + sample.label.duration_us - 1,
-        )
-        np.testing.assert_array_equal(row, expected)
-    rows, labels, numbers = training_set(samples, images)
-    np.testing.assert_array_equal(rows, np.concatenate([samples.rows[3:], images.rows]))
-    assert labels == 2 * [sample.label.label for sample in seen]
-    assert numbers.tolist() == 2 * [0, 1, 2, 3, 4]
-    assert len(training_set(samples, None)[0]) == 5

@@ -11,14 +11,17 @@ import struct
 import subprocess
 import sys
 import time
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
 
 import decode_hostile
+import lz4.frame
 import numpy as np
 import pytest
 import tiny
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from safetensors.numpy import save
@@ -173,6 +176,59 @@ def test_hdf5_that_never_ends(tmp_path):
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"a\.h5: .*(does not come to an end|damaged)"):
         read_events(path)
+
+
+def npy_claiming(shape):
+    out = io.BytesIO()
+    header = {"descr": "<i8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(out, header)
+    return out.getvalue() + bytes(64)
+
+
+def npz_claiming(size):
+    data = bytearray(npz_of(t=np.zeros(9), x=np.zeros(9), y=np.zeros(9), p=np.zeros(9)))
+    at = data.index(b"PK\x01\x02")
+    data[at + 24 : at + 28] = struct.pack("<I", size)  # bytes when unpacked, in the directory
+    return bytes(data)
+
+
+def aedat4_of(compression, pack):
+    seed = next(seed for seed in TARGETS["camera file AEDAT4"].seeds() if compression in seed)
+    at = seed.index(b"</dv>") + 5
+    return seed[:at] + struct.pack("<2i", 0, len(pack)) + pack
+
+
+CLAIMS = {
+    "a.npy": lambda: npy_claiming((1 << 40, 4)),
+    "b.npy": lambda: npy_claiming((1 << 62, 4)),
+    "c.npz": lambda: npz_claiming(0xFFFFFFF0),
+    "d.aedat4": lambda: aedat4_of(b"\x04\x22\x4d\x18", lz4.frame.compress(bytes(200 << 20))),
+    "e.aedat4": lambda: aedat4_of(
+        b"\x28\xb5\x2f\xfd", zstandard.ZstdCompressor(write_content_size=True).compress(bytes(200 << 20))
+    ),
+    "f.aedat": lambda: (
+        b"#!AER-DAT3.1\r\n#Format: RAW\r\n#!END-HEADER\r\n"
+        + struct.pack("<hhiiiiii", 1, 0, 8, 4, 0, 0, 0x7FFFFFFF, 0)
+    ),
+    "g.es": lambda: b"Event Stream\x02\x00\x00\x01\xff\xff\xff\xff" + b"\xff" * 1000,
+    "h.txt": lambda: b"1" * 3_000_000,
+}
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_what_claims_gigabytes_takes_neither_them_nor_a_second(name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(CLAIMS[name]())
+    tracemalloc.start()
+    started = time.process_time()
+    with contextlib.suppress(InputError):
+        read = read_events(path)
+        assert len(read.events) < 100
+        assert read.damage
+    took, (_, most) = time.process_time() - started, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert took < 1
+    assert most < 256 << 20
 
 
 def test_hdf5_with_rows_that_nobody_wrote(tmp_path):

@@ -142,6 +142,14 @@ def test_features_are_those_of_the_window_however_it_is_fed_and_read(kind, data)
     assert_every_way_agrees(case, events, data.draw(st.integers(-5000, 5000)), data.draw(st.integers(0, 99)))
 
 
+@pytest.mark.parametrize("kind", KINDS, ids=ids)
+def test_features_are_those_of_the_window_on_streams_that_cross_many_bins(kind):
+    for seed in range(4):
+        case = known_case(kind)
+        events = random_events(np.random.default_rng(seed), case.geometry, case.resolution, 120)
+        assert_every_way_agrees(case, events, 0, seed)
+
+
 @pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)
 def test_features_of_independent_atoms_agree_within_the_bound_of_the_gap(kind):
     for seed in range(4):
@@ -178,7 +186,7 @@ def test_features_are_those_of_the_window_after_every_batch(kind, look_ahead, da
 @pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
 @settings(max_examples=EXAMPLES)
 @given(data=st.data())
-def test_a_trace_holds_what_a_reading_after_each_event_would_have_given(kind, data):
+def test_a_trace_holds_what_an_emission_after_each_event_would_have_given(kind, data):
     case = data.draw(cases(kind))
     events = data.draw(streams(case, 40))
     engine, read = case.engine(look_ahead=True), case.engine()
@@ -194,7 +202,7 @@ def test_a_trace_holds_what_a_reading_after_each_event_would_have_given(kind, da
 @pytest.mark.parametrize("kind", KINDS, ids=ids)
 @settings(max_examples=EXAMPLES)
 @given(data=st.data())
-def test_following_leaves_nothing_to_do_for_a_reading(kind, look_ahead, data):
+def test_following_leaves_nothing_to_do_for_an_emission(kind, look_ahead, data):
     case = data.draw(cases(kind))
     events = data.draw(streams(case, 20))
     engine = case.engine(look_ahead=look_ahead)

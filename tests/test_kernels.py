@@ -1,11 +1,16 @@
 """Every compiled kernel against its slow twin, on random arguments, bit for bit."""
 
+import ast
 import importlib
+import inspect
 import pkgutil
+import textwrap
+from collections import Counter
 
 import naive
 import numpy as np
 import pytest
+from kernel_cases import CASES, STEPS, cases_of, reached
 from kernel_table import KERNELS, Run, copied
 from numba.core.errors import NumbaError
 from numba.core.registry import CPUDispatcher
@@ -14,7 +19,14 @@ from streamfeat import kernels
 from streamfeat.kernels import compiled
 from streamfeat.kernels.lasso import duality_gap, solve_lasso_rows
 
-ROUNDS = 50
+ROUNDS, MOST_ROUNDS = 50, 400
+"""Calls of a row: at least, and at most until each of its cases was reached."""
+
+OFTEN = 3
+"""Calls that must reach a case."""
+
+NO_CASES: set[str] = set()
+"""Kernels that branch, and whose rows name no case yet."""
 
 
 def all_kernels():
@@ -32,10 +44,30 @@ def run(function, arguments):
 
 
 @pytest.mark.parametrize("row", KERNELS, ids=lambda row: row.name)
-def test_kernel_does_what_its_twin_does(row):
-    for seed in range(ROUNDS):
+def test_kernel_does_what_its_twin_does_in_every_case(row):
+    missed, found = cases_of(row), Counter()
+    for seed in range(MOST_ROUNDS):
+        if seed >= ROUNDS and not missed:
+            break
         arguments = row.make(np.random.default_rng([seed, 7]))
-        row.agree(run(row.kernel, arguments), run(row.twin, arguments))
+        kernel, twin = (run(function, arguments) for function in (row.kernel, row.twin))
+        row.agree(kernel, twin)
+        if missed:
+            found.update(reached(row, twin))
+            missed = {name for name in cases_of(row) if found[name] < OFTEN}
+    assert not missed, f"{row.name}: no argument of its row is one of these cases: {sorted(missed)}"
+
+
+def branches(kernel):
+    """Whether a kernel takes one of two ways."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kernel.py_func)))
+    return any(isinstance(node, ast.If | ast.IfExp | ast.While) for node in ast.walk(tree))
+
+
+def test_a_row_names_its_cases_where_its_kernel_branches():
+    without = {row.name for row in KERNELS if branches(row.kernel) and not cases_of(row)}
+    assert without == NO_CASES
+    assert CASES.keys() | STEPS.keys() <= {row.name for row in KERNELS}
 
 
 def test_every_kernel_has_a_row_and_a_twin():

@@ -16,6 +16,7 @@ NAMES = [
     name for name in sf.__all__ if inspect.isclass(getattr(sf, name)) or inspect.isfunction(getattr(sf, name))
 ]
 NEW = ["Emission", "EmitPolicy", "EventFeatures", "Pipeline", "Session", "learn_encoder", "listen", "replay"]
+NEW += ["general_encoder"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -60,7 +61,7 @@ def test_the_example_of_a_public_name_runs(name, folder, monkeypatch):
         if name == "learn_encoder":
             source = source.replace("patch=10", "patch=4").replace("volumes=4000", "volumes=400")
         value = run(source, known)
-        if example.want and name in ("EmitPolicy", "Pipeline"):
+        if example.want and name in ("EmitPolicy", "Pipeline", "general_encoder"):
             assert value == example.want
     if name == "learn_encoder":
         assert sf.Encoder.load(Path("model.safetensors")).n_filters == 64

@@ -66,10 +66,21 @@ def cut(items, rng):
         ("500us", "time", 500),
         ("2s", "time", 2_000_000),
         ("auto", "auto", 1),
+        ("bin", "bin", 1),
     ],
 )
 def test_policies_are_parsed(text, kind, every):
     assert EmitPolicy.parse(text) == EmitPolicy(kind, every)
+    assert EmitPolicy.parse(str(EmitPolicy(kind, every))) == EmitPolicy(kind, every)
+
+
+def test_at_every_bin_is_at_every_multiple_of_its_length():
+    items = tiny.labelled_items(3)
+    policies = ("bin", f"{tiny.GEOMETRY.bin_us}us")
+    bins, times = (run(items, policy)[0] for policy in policies)
+    assert [(e.t_us, e.features.tobytes()) for e in bins] == [(e.t_us, e.features.tobytes()) for e in times]
+    assert len(bins) == 6
+    assert all(e.active_volumes > 0 for e in bins if e.final)
 
 
 @pytest.mark.parametrize(
@@ -509,23 +520,51 @@ def test_an_event_behind_a_silence_does_not_turn_time_back(policy):
     assert after[-1].n_events == 4
 
 
+class Resting:
+    """A session whose engine notes what it is asked to prepare, and takes 10 s for it."""
+
+    def __init__(self, policy):
+        self.asked, self.clock = [], FakeClock()
+        self.session = Session(MODEL, EmitPolicy.parse(policy), clock=self.clock, engine=self.engine)
+        list(self.session.process(tiny.packet(tiny.stream([1000]))))
+
+    def engine(self, *arguments, **options):
+        rest = self
+
+        class Watched(Engine):
+            def prepare(self, columns):
+                rest.asked.append(columns)
+                rest.clock.now += 10.0
+                return super().prepare(columns)
+
+        return Watched(*arguments, **options)
+
+
 def test_looking_ahead_is_bounded_in_columns():
     """A rest takes a fraction of a millisecond, however large the sensor."""
-    asked = []
+    resting = Resting("event")
+    resting.clock.now += 1.0
+    resting.session.rest()
+    assert resting.asked == [4096]
 
-    class Watched(Engine):
-        def prepare(self, columns):
-            asked.append(columns)
-            return super().prepare(columns)
 
-    clock = FakeClock()
-    session = Session(MODEL, EmitPolicy.parse("event"), clock=clock, engine=Watched)
-    for i in range(3):
-        list(session.process(tiny.packet(tiny.stream([1000 * i]))))
-        clock.now += 1.0
-        session.rest()
-    assert asked
-    assert max(asked) <= 4096
+def test_looking_ahead_takes_half_of_the_time_at_most():
+    resting = Resting("10ms")
+    resting.session.rest()
+    resting.session.rest()
+    resting.clock.now += 9.9
+    resting.session.rest()
+    assert len(resting.asked) == 1
+    resting.clock.now += 0.2
+    resting.session.rest()
+    assert len(resting.asked) == 2
+
+
+def test_a_session_that_emits_as_often_as_it_can_does_not_look_ahead():
+    resting = Resting("auto")
+    resting.clock.now += 100.0
+    resting.session.rest()
+    assert resting.asked == []
 
 
 @pytest.mark.parametrize("policy", ["10ms", "auto"])

@@ -14,9 +14,11 @@ import tiny
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from live_net import Collector, attachment, compiled, free_port, plain_session, until
-from streams import KINDS, cases, streams
+from streams import KINDS, LASSO_KINDS, cases, random_encoder, random_events, streams
 from test_live_listen import MODEL, batches, message, replayed
 
+from streamfeat.engine.engine import Engine
+from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
@@ -72,6 +74,27 @@ def test_an_engine_that_is_restored_anywhere_goes_on_with_the_same_bits(kind, da
     assert engine.window_us == other.window_us
     mine, theirs = engine.stats(), other.stats()
     assert replace(mine, encoded_volumes=0) == replace(theirs, encoded_volumes=0)
+
+
+@pytest.mark.parametrize("kind", LASSO_KINDS, ids="-".join)
+def test_engines_that_look_ahead_go_on_from_the_codes_of_a_snapshot_alone(kind):
+    """A lasso that the other plane has solved before would be where the next starts, in one of them."""
+    geometry = Geometry(patch=3, stride=2, n_bins=3, bin_us=1000, max_count=2)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        encoder = random_encoder(rng, geometry, 33, *kind)
+        events = random_events(rng, geometry, (13, 18), 400)
+        engine, other = (Engine(encoder, (13, 18), look_ahead=True) for _ in range(2))
+        batches = np.array_split(events, 20)
+        for batch in batches[:10]:
+            engine.feed(batch)
+            engine.prepare(10**6)
+        other.restore(engine.snapshot())
+        for batch in batches[10:]:
+            for one in (engine, other):
+                one.feed(batch)
+                one.prepare(10**6)
+            assert engine.features().tobytes() == other.features().tobytes()
 
 
 @pytest.mark.parametrize(
@@ -208,7 +231,7 @@ def test_readings_between_events_and_silences_do_not_go_back():
 
 
 def test_a_file_never_says_more_than_was_written(tmp_path):
-    """Readings that no sink has taken yet are made again."""
+    """Emissions that no sink has taken yet are made again."""
     path = tmp_path / "state"
     job = Job(path)
     packets = [tiny.packet(events) for events in batches(8)]

@@ -304,6 +304,31 @@ def test_types_under_all_their_names(tmp_path, package, layout):
     assert counts == {}
 
 
+@pytest.mark.parametrize(
+    "name", ["event_camera_msgs::msg::dds_::EventPacket_", "event_array_msgs::msg::EventArray"]
+)
+def test_types_as_dds_and_c_plus_plus_write_them(tmp_path, name):
+    events = moving_dot(400, 5_000_000)
+    _, found, _ = read(store(tmp_path / "a.mcap", messages(events), schema=name))
+    np.testing.assert_array_equal(found, events)
+
+
+@pytest.mark.parametrize("bits", [24, 31, 32])
+@pytest.mark.parametrize("encoding", ["mono", "libcaer_cmp"])
+def test_a_clock_that_wraps_goes_on(tmp_path, bits, encoding):
+    events = moving_dot(4000, (1 << bits) - 500_000)
+    parts = np.split(events, 20)
+    made = []
+    for i, part in enumerate(parts):
+        short = part.copy()
+        short["t"] -= int(part["t"][0]) >> bits << bits
+        made += messages(short, encoding, host_us=i * 50_000, seq=i)
+    packets, found, counts = read(store(tmp_path / "a.mcap", made))
+    np.testing.assert_array_equal(found, events)
+    assert {packet.epoch for packet in packets} == {0}
+    assert counts == {"wraps": 1}
+
+
 @pytest.mark.parametrize("package", ["event_camera_msgs/EventPacket", "dvs_msgs/EventArray"])
 def test_a_ros1_message_that_is_cut_short_is_counted(tmp_path, package):
     made = [
@@ -427,3 +452,33 @@ def test_windows_of_learning_begin_anew_with_the_clock(tmp_path):
         (5_000_000, 400),
         (4_400_000, 400),
     ]
+
+
+def evt3_at(times):
+    """A packet of evt3 with these times in any order: one TIME_HIGH and one TIME_LOW for each."""
+    words = []
+    for i, t in enumerate(times):
+        high, low = (int(t) >> 12) & 0xFFF, int(t) & 0xFFF
+        words += [0x8000 | high, 0x6000 | low, i // 7 % HEIGHT, 0x2000 | i % WIDTH]
+    return np.array(words, "<u2").tobytes()
+
+
+@pytest.mark.parametrize("ahead_us", [4_000_000, 9_000_000, 12_000_000, 16_000_000, 3_600_000_000])
+@pytest.mark.parametrize("number", [1, 10, 18])
+@pytest.mark.parametrize("strays", [slice(0, 1), slice(100, 101), slice(199, 200), slice(0, 200)])
+def test_strays_more_than_half_of_evt3s_range_ahead_are_no_wrap(tmp_path, ahead_us, number, strays):
+    made = []
+    for i, part in enumerate(np.split(moving_dot(4000, 5_000_000), 20)):
+        times = part["t"].copy()
+        if i == number:
+            times[strays] += ahead_us
+        log_ns = HOST_NS + i * 50_000_000
+        message = EventPacket(log_ns, "cam", HEIGHT, WIDTH, i, 0, "evt3", False, evt3_at(times))
+        made.append(Message(log_ns, message.to_cdr(), i))
+    _, events, counts = read(store(tmp_path / "a.mcap", made))
+    assert len(events) == 4000 - (strays.stop - strays.start)
+    assert 5_000_000 <= events["t"].min() < events["t"].max() < 6_000_000
+    assert (np.diff(events["t"]) > 0).all()
+    n = strays.stop - strays.start
+    assert (counts.pop("stray packets", 0), counts.pop("stray events", 0)) == ((1, 0) if n == 200 else (0, n))
+    assert counts == {}

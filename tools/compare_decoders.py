@@ -1,28 +1,34 @@
-"""Compare the decoders of event files: right or wrong, and how quick.
+"""Compare the decoders of event files: the same events or not, and how quick.
 
-Prints one line for each library and format: events, million events a second (median of interleaved runs, in
-this process, after one unmeasured run), and whether the events equal the reference. The reference is the
-format as published, decoded one word at a time in plain Python, or, for AEDAT4, the vendor's own library.
-Libraries that are not installed are left out (`pip install faery expelliarmus eventcv dv-processing`).
-
-For EVT3 an extra line shows the range that the file's own TIME_HIGH words allow for its times.
+For each format that another library reads, on the samples of the shared data and on generated files: whether
+its events equal ours, and where they do not, which of the two equals the format as published, decoded one
+word at a time in plain Python. Rates are million events a second, the median of runs that are interleaved in
+this process, after one unmeasured run; a library that fails or differs has none. Libraries that are not
+installed are named and left out (`pip install faery expelliarmus eventcv dv-processing evlib`).
 """
 
 import argparse
+import datetime
+import importlib.metadata
 import importlib.util
 import os
 import platform
 import statistics
 import struct
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from streamfeat.camera_files.event_files import read_events
+from streamfeat.convert.outputs import open_output
 from streamfeat.events import Events, make_events
+
+SIZE = (480, 640)
 
 
 def main() -> None:
@@ -31,66 +37,133 @@ def main() -> None:
     )
     data = Path(os.environ.get("STREAMFEAT_DATA", Path(__file__).parents[2] / "shared" / "data"))
     parser.add_argument(
-        "--folder", type=Path, default=data / "samples", help="sample files (default: %(default)s)"
+        "--folder", type=Path, default=data / "samples", help="samples (default: %(default)s)"
     )
-    parser.add_argument("--dat", type=Path, help="one .dat file to measure too")
     parser.add_argument("--runs", type=int, default=9, help="interleaved runs (default: %(default)s)")
+    parser.add_argument(
+        "--events", type=int, default=500_000, help="of generated files (default: %(default)s)"
+    )
     args = parser.parse_args()
-    paths = {
-        "evt2": args.folder / "evt2_640x480.raw",
-        "evt3": args.folder / "evt3_1280x720.raw",
-        "aedat4": args.folder / "dvs_320x240.aedat4",
-        "bin40": args.folder / "ncaltech101_faces_easy_0001.bin",
-    } | ({"dat": args.dat} if args.dat else {})
-    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, NumPy {np.__version__}\n")
-    print("| format | library | events | Mev/s | against the reference |")
-    print("|---|---|---:|---:|---|")
-    for name, path in paths.items():
-        reference = REFERENCES[name](path)
-        readers, results = {}, {}
-        for library, read in READERS[name].items():
-            if importlib.util.find_spec(library) is None:
-                continue
-            try:
-                results[library] = read(path)
-            except Exception as error:  # each library has its own, down to Exception itself
-                print(f"| {name} | {library} | | | fails: {error!s:.80} |")
-            else:
-                readers[library] = read
-        rates: dict[str, list[float]] = {library: [] for library in readers}
-        for _ in range(args.runs):
-            for library, read in readers.items():
-                start = time.perf_counter()
-                read(path)
-                rates[library].append(len(results[library]) / (time.perf_counter() - start) / 1e6)
-        for library, events in results.items():
-            verdict = differences(events, reference)
-            rate = statistics.median(rates[library])
-            print(f"| {name} | {library} | {len(events)} | {rate:.1f} | {verdict} |")
+    there = {library: importlib.util.find_spec(library) is not None for library in LIBRARIES}
+    named = [f"{name} {importlib.metadata.version(name)}" for name in LIBRARIES if there[name]]
+    left_out = ", ".join(name for name in LIBRARIES if not there[name]) or "none"
+    print(f"`{' '.join(['python', *sys.argv])}`, {datetime.date.today()}: {platform.machine()}, "
+          f"{os.cpu_count()} cores, {', '.join(named)}; not installed: {left_out}\n")  # fmt: skip
+    print("| format | file | events | ours = theirs | ours, Mev/s | the best library, Mev/s |")
+    print("|---|---|---:|---|---:|---:|")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, path in (*samples(args.folder), *generated(Path(folder), args.events)):
+            readers = {library: read for library, read in READERS[name].items() if there[library]}
+            print(row(name, path, readers, args.runs, is_sample=path.parent == args.folder), flush=True)
 
 
-def differences(events: Events, reference: Events) -> str:
-    if len(events) != len(reference):
-        return f"{len(events) - len(reference):+} events"
+def row(name: str, path: Path, readers: dict[str, "Read"], runs: int, *, is_sample: bool) -> str:
+    """One line of the table."""
+    mine = read_events(path).events
+    verdicts, right = [], {}
+    truth: Events | None = None
+    for library, read in readers.items():
+        try:
+            theirs = read(path)
+        except Exception as error:  # each library has its own, down to Exception itself
+            verdicts.append(f"{library} fails: {' '.join(str(error).split())[:70]}")
+            continue
+        if different := differences(mine, theirs):
+            if truth is None and name in PUBLISHED:
+                truth = PUBLISHED[name](path)
+            verdicts.append(f"{library}: {different}{judged(mine, theirs, truth)}")
+        else:
+            right[library] = read
+    rates: dict[str, list[float]] = {library: [] for library in ("", *right)}
+    for _ in range(runs):
+        for library, read in {"": lambda path: read_events(path).events, **right}.items():
+            start = time.perf_counter()
+            read(path)
+            rates[library].append(len(mine) / (time.perf_counter() - start) / 1e6)
+    medians = {library: statistics.median(found) for library, found in rates.items()}
+    ours = medians.pop("")
+    best = max(medians, key=medians.__getitem__, default="")
+    equal = [f"yes: {', '.join(right)}"] if right else []
+    theirs_best = f"{best} {medians[best]:.1f}" if best else ""
+    shown = path.name if is_sample else "generated"
+    verdict = "; ".join([*equal, *verdicts])
+    return f"| {name} | {shown} | {len(mine):,} | {verdict} | {ours:.1f} | {theirs_best} |"
+
+
+def differences(mine: Events, theirs: Events) -> str:
+    """How theirs differ from ours, in a few words; empty where they do not."""
+    if len(mine) != len(theirs):
+        return f"{len(theirs) - len(mine):+,} events"
     found = []
     for field in "xypt":
-        delta = events[field].astype(np.int64) - reference[field].astype(np.int64)
-        if delta.any():
-            n = np.count_nonzero(delta)
-            found.append(f"{field} differs in {n} events, by {delta.min():+} to {delta.max():+}")
-    return "; ".join(found) or "equal"
+        delta = theirs[field].astype(np.int64) - mine[field].astype(np.int64)
+        if n := int(np.count_nonzero(delta)):
+            found.append(f"{field} of {n:,} events differs by {delta.min():+} to {delta.max():+}")
+    return ", ".join(found)
+
+
+def judged(mine: Events, theirs: Events, truth: Events | None) -> str:
+    """Which of two is right."""
+    if truth is None:
+        return ""
+    equal = [name for name, events in (("ours", mine), ("theirs", theirs)) if not differences(truth, events)]
+    return f" ({' and '.join(equal) or 'neither'} as published)"
+
+
+def samples(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Recordings of real cameras."""
+    for name, file in (
+        ("evt2", "evt2_640x480.raw"),
+        ("evt3", "evt3_1280x720.raw"),
+        ("aedat4", "dvs_320x240.aedat4"),
+        ("bin40", "ncaltech101_faces_easy_0001.bin"),
+    ):
+        if (folder / file).exists():
+            yield name, folder / file
+
+
+def generated(folder: Path, n: int) -> Iterator[tuple[str, Path]]:
+    """Random events over 20 seconds, so that the clock of EVT3 turns, in files of ours and of faery."""
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 20_000_000, n))
+    t -= t[0]  # faery and others write and read some formats from their first event on
+    events = make_events(rng.integers(0, SIZE[1], n), rng.integers(0, SIZE[0], n), rng.integers(0, 2, n), t)
+    for name, file in (("evt3", "a.raw"), ("hdf5", "a.h5"), ("csv", "a.csv")):
+        with open_output(folder / file) as output:
+            output.write(events, SIZE)
+        yield name, folder / file
+    words = np.empty((n, 2), "<u4")
+    words[:, 0] = t
+    words[:, 1] = events["x"] | events["y"].astype("<u4") << 14 | events["p"].astype("<u4") << 28
+    head = b"% Version 2\n% Width 640\n% Height 480\n\x0c\x08"
+    (folder / "a.dat").write_bytes(head + words.tobytes())
+    yield "dat", folder / "a.dat"
+    if importlib.util.find_spec("faery"):
+        import faery
+
+        rows = np.zeros(n, faery.EVENTS_DTYPE)
+        for mine, field in zip("xypt", ("x", "y", "on", "t"), strict=True):
+            rows[field] = events[mine]
+        for name in ("es", "aedat4"):
+            faery.events_stream_from_array(rows, SIZE[::-1]).to_file(folder / f"b.{name}")
+            yield name, folder / f"b.{name}"
+
+
+Read = Callable[[Path], Events]
 
 
 def with_faery(path: Path) -> Events:
     import faery
 
     version = "evt2" if b"% evt 2.0" in path.read_bytes()[:500] else None
-    batches = list(faery.events_stream_from_file(path, version_fallback=version))
-    packets = np.concatenate(batches)
-    return make_events(packets["x"], packets["y"], packets["on"], packets["t"])
+    options: dict[str, Any] = {"version_fallback": version}
+    if path.suffix == ".csv":
+        options = {"dimensions_fallback": SIZE[::-1], "csv_properties": faery.CsvProperties.default()}
+    rows = np.concatenate(list(faery.events_stream_from_file(path, **options)))
+    return make_events(rows["x"], rows["y"], rows["on"], rows["t"])
 
 
-def with_expelliarmus(encoding: str) -> Callable[[Path], Events]:
+def with_expelliarmus(encoding: str) -> Read:
     def read(path: Path) -> Events:
         import expelliarmus
 
@@ -104,7 +177,15 @@ def with_eventcv(path: Path) -> Events:
     import eventcv
 
     x, y, t, p = eventcv.load(str(path), time_unit="microseconds").numpy().T
-    return make_events(x, y, p, t)
+    return make_events(x, y, p > 0, t)
+
+
+def with_evlib(path: Path) -> Events:
+    import evlib
+
+    rows = evlib.load_events(str(path)).collect()
+    t = rows["t"].dt.total_microseconds().to_numpy()
+    return make_events(rows["x"].to_numpy(), rows["y"].to_numpy(), rows["polarity"].to_numpy() > 0, t)
 
 
 def with_dv_processing(path: Path) -> Events:
@@ -118,10 +199,6 @@ def with_dv_processing(path: Path) -> Events:
     return make_events(rows["x"], rows["y"], rows["polarity"], rows["timestamp"])
 
 
-def with_streamfeat(path: Path) -> Events:
-    return read_events(path).events
-
-
 def after_header(path: Path) -> bytes:
     data = path.read_bytes()
     start = 0
@@ -130,93 +207,41 @@ def after_header(path: Path) -> bytes:
     return data[start:]
 
 
-def reference_evt2(path: Path) -> Events:
-    high, rows = 0, []
-    for (word,) in struct.iter_unpack("<I", after_header(path)):
-        kind = word >> 28
-        if kind == 8:
-            high = word & 0xFFFFFFF
-        elif kind in (0, 1):
-            rows.append((word >> 11 & 0x7FF, word & 0x7FF, kind, high << 6 | word >> 22 & 0x3F))
-    return make_events(*np.array(rows).T)
-
-
-def reference_evt3(path: Path) -> Events:
-    """t = TIME_HIGH << 12 | TIME_LOW, whatever came before; the sample file has no wrap."""
-    high = low = y = base = polarity = 0
-    highs, rows = [], []
+def published_evt3(path: Path) -> Events:
+    """t = TIME_HIGH << 12 | TIME_LOW; a fall of TIME_HIGH by more than half its range is a turn."""
+    high = turns = low = y = base = polarity = 0
+    rows = []
     for (word,) in struct.iter_unpack("<H", after_header(path)):
         kind, value = word >> 12, word & 0xFFF
         if kind == 0x8:
+            turns += high - value > 0x7FF
             high = value
-            highs.append(value)
         elif kind == 0x6:
             low = value
         elif kind == 0x0:
             y = value & 0x7FF
         elif kind == 0x2:
-            rows.append((value & 0x7FF, y, value >> 11, high << 12 | low))
+            rows.append((value & 0x7FF, y, value >> 11, turns << 24 | high << 12 | low))
         elif kind == 0x3:
             base, polarity = value & 0x7FF, value >> 11
         elif kind in (0x4, 0x5):
-            width = 12 if kind == 0x4 else 8
-            rows += [(base + i, y, polarity, high << 12 | low) for i in range(width) if value >> i & 1]
+            width, t = (12 if kind == 0x4 else 8), turns << 24 | high << 12 | low
+            rows += [(base + i, y, polarity, t) for i in range(width) if value >> i & 1]
             base += width
-    events = make_events(*np.array(rows).T)
-    assert min(highs) << 12 <= events["t"].min()
-    assert events["t"].max() < (max(highs) + 1) << 12
-    print(f"| evt3 | (its TIME_HIGH words) | | | times from {min(highs) << 12} to {(max(highs) + 1) << 12} |")
-    return events
-
-
-def reference_bin40(path: Path) -> Events:
-    rows = []
-    for x, y, high, middle, low in struct.iter_unpack("5B", path.read_bytes()):
-        rows.append((x, y, high >> 7, (high & 0x7F) << 16 | middle << 8 | low))
     return make_events(*np.array(rows).T)
 
 
-def reference_dat(path: Path) -> Events:
-    rows = []
-    for t, word in struct.iter_unpack("<II", after_header(path)[2:]):
-        rows.append((word & 0x3FFF, word >> 14 & 0x3FFF, word >> 28, t))
-    return make_events(*np.array(rows).T)
-
-
-READERS: dict[str, dict[str, Callable[[Path], Any]]] = {
-    "evt2": {
-        "streamfeat": with_streamfeat,
-        "faery": with_faery,
-        "expelliarmus": with_expelliarmus("evt2"),
-        "eventcv": with_eventcv,
-    },
-    "evt3": {
-        "streamfeat": with_streamfeat,
-        "faery": with_faery,
-        "expelliarmus": with_expelliarmus("evt3"),
-        "eventcv": with_eventcv,
-    },
-    "aedat4": {
-        "streamfeat": with_streamfeat,
-        "faery": with_faery,
-        "eventcv": with_eventcv,
-        "dv_processing": with_dv_processing,
-    },
-    "bin40": {"streamfeat": with_streamfeat},
-    "dat": {
-        "streamfeat": with_streamfeat,
-        "faery": with_faery,
-        "expelliarmus": with_expelliarmus("dat"),
-        "eventcv": with_eventcv,
-    },
+LIBRARIES = ("faery", "expelliarmus", "eventcv", "dv_processing", "evlib")
+_COMMON: dict[str, Read] = {"faery": with_faery, "eventcv": with_eventcv, "evlib": with_evlib}
+READERS: dict[str, dict[str, Read]] = {
+    **{name: {**_COMMON, "expelliarmus": with_expelliarmus(name)} for name in ("evt2", "evt3", "dat")},
+    "aedat4": {**_COMMON, "dv_processing": with_dv_processing},
+    "hdf5": {"eventcv": with_eventcv, "evlib": with_evlib},
+    "csv": _COMMON,
+    "es": {"faery": with_faery},
+    "bin40": {"eventcv": with_eventcv, "evlib": with_evlib},
 }
-REFERENCES: dict[str, Callable[[Path], Events]] = {
-    "evt2": reference_evt2,
-    "evt3": reference_evt3,
-    "aedat4": with_dv_processing,
-    "bin40": reference_bin40,
-    "dat": reference_dat,
-}
+PUBLISHED: dict[str, Read] = {"evt3": published_evt3}
 
 if __name__ == "__main__":
     main()

@@ -3,13 +3,13 @@
 python tools/lowest_bounds.py > lowest.txt && pip install -e '.[test]' -c lowest.txt
 """
 
-import re
 import tomllib
 from itertools import chain
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
-BOUNDS = re.compile(r"(?P<name>[\w.-]+)>=(?P<lowest>[\d.]+),<[\d.]+")
 
 
 def lowest() -> dict[str, str]:
@@ -21,8 +21,9 @@ def lowest() -> dict[str, str]:
     project = tomllib.loads(PROJECT.read_text())["project"]
     versions: dict[str, str] = {}
     for line in chain(project["dependencies"], *project["optional-dependencies"].values()):
-        bounds = BOUNDS.fullmatch(line)
-        if not bounds or versions.setdefault(bounds["name"], bounds["lowest"]) != bounds["lowest"]:
+        asked = Requirement(line)
+        bounds = {bound.operator: bound.version for bound in asked.specifier}
+        if bounds.keys() != {">=", "<"} or versions.setdefault(asked.name, bounds[">="]) != bounds[">="]:
             raise ValueError(f"{line}: one lower and one upper bound, the same wherever it is named")
     return versions
 

@@ -1,16 +1,23 @@
-"""AEDAT 2.0 and 3.1, the files of jAER and cAER.
+"""AEDAT 1.0, 2.0 and 3.1, the files of jAER and cAER.
 
 Lives here: their headers, and records to events, a bounded block at a time.
 Not here: AEDAT 4 (`aedat4`), and which format a file has (`event_files`).
 
-Where the y axis begins and which polarity is ON differ between chips and tools, so what is read is said. jAER
-shows a DAVIS with x mirrored and y from the bottom (`DavisBaseCamera`), as v2e writes it; eventcv 1.0.8 turns
-y only. Files that name no chip, as those of CIFAR10-DVS, are read as their addresses stand.
+Where the axes begin and which polarity is ON differ between chips and tools, so what is read is said.
+
+- A DAVIS has x mirrored and y from the bottom, as jAER shows it (`DavisBaseCamera`) and v2e writes it;
+  eventcv 1.0.8 turns y only.
+- A DVS128 that a header names has both too, and ON where bit 0 is clear (jAER's `DVS128.Extractor`; the
+  MATLAB reader of MNIST-DVS and the reader of CIFAR10-DVS in SpikingJelly agree on the polarity). The page of
+  iniVation has ON where the bit is set, but jAER wrote these files.
+- Files that name no chip are of jAER before 2014, or of other tools that write plain pixels; they are read as
+  their addresses stand, as evlib and tonic do.
 """
 
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +28,7 @@ from streamfeat.camera_files.source import Contents, Losses, TableOptions
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, make_events
 
-__all__ = ["open_aedat2", "open_aedat3"]
+__all__ = ["open_aedat1", "open_aedat2", "open_aedat3"]
 
 _CHIPS = (
     ("dvs128", (128, 128)),
@@ -31,6 +38,8 @@ _CHIPS = (
     ("davis128", (128, 128)),
     ("davis208", (192, 208)),
 )
+_CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+_DVS128_SIDE = 128
 _PACKET = struct.Struct("<hhiiiiii")
 _LARGEST_PACKET = 64 << 20
 
@@ -44,10 +53,15 @@ def _chip(header: str) -> tuple[str, Resolution | None]:
 
 
 def _header(path: Path, head: bytes, end: bytes) -> tuple[str, int]:
-    """Lines that begin with #, up to a line `end` where there must be one, and the byte after them."""
+    """Lines that begin with #, up to a line `end` where there must be one, and the byte after them.
+
+    The first address may begin with the byte of a #: what has control characters in it is no line.
+    """
     start = 0
     while head.startswith(b"#", start):
         stop = head.find(b"\n", start)
+        if _CONTROL.search(head, start, stop if stop > 0 else len(head)):
+            break
         if stop < 0:
             raise InputError(f"{path}: header line at byte {start} does not end; the file is cut short")
         line, start = head[start:stop].strip(), stop + 1
@@ -58,26 +72,68 @@ def _header(path: Path, head: bytes, end: bytes) -> tuple[str, int]:
     return head[:start].decode("ascii", "replace"), start
 
 
+def open_aedat1(path: Path, head: bytes, options: TableOptions) -> Contents:
+    """AEDAT 1.0: big-endian addresses of 16 bits, and microseconds; the header may be missing."""
+    header, start = _header(path, head, b"")
+    chip, _ = _chip(header)
+    if chip.startswith("davis"):
+        raise InputError(f"{path}: AEDAT 1.0 addresses have 16 bits, which hold none of a {chip}")
+    contents = _dvs128("1.0", ">u2", path, start, chip)
+    if header.startswith("#!AER-DAT1"):
+        return contents
+    said = "AEDAT 1.0, because it names no version"
+    return replace(contents, assumptions=(said, *contents.assumptions))
+
+
 def open_aedat2(path: Path, head: bytes, options: TableOptions) -> Contents:
-    """AEDAT 2.0: big-endian addresses and microseconds."""
+    """AEDAT 2.0: big-endian addresses of 32 bits, and microseconds."""
     header, start = _header(path, head, b"")
     chip, resolution = _chip(header)
     if chip.startswith("davis"):
         assert resolution
         said = f"AEDAT 2.0 addresses of a {chip}: x is mirrored and y from the bottom, as jAER has it"
         return Contents(partial(_read_davis, path, start, resolution), resolution, start, assumptions=(said,))
-    said = "AEDAT 2.0 addresses of a DVS128, as they stand: x and y from 0, ON where bit 0 is set"
-    return Contents(partial(_read_dvs128, path, start), (128, 128), start, assumptions=(said,))
+    return _dvs128("2.0", ">u4", path, start, chip)
 
 
-def _read_dvs128(path: Path, start: int, losses: Losses) -> Iterator[Events]:
-    """Address: polarity in bit 0, x in bits 1-7, y in bits 8-14; bit 15 is no pixel."""
+def _dvs128(version: str, address: str, path: Path, start: int, chip: str) -> Contents:
+    """A DVS128 as jAER shows it where `chip` names it, or its addresses as they stand."""
+    said = (
+        "x is mirrored, y from the bottom, and ON where bit 0 is clear, as jAER has it"
+        if chip
+        else "as they stand, because the header names no chip: x and y from 0, ON where bit 0 is set"
+    )
+    return Contents(
+        partial(_read_dvs128, path, start, np.dtype([("address", address), ("us", ">u4")]), bool(chip)),
+        (_DVS128_SIDE, _DVS128_SIDE),
+        start,
+        assumptions=(f"AEDAT {version} addresses of a DVS128, {said}",),
+    )
+
+
+def _read_dvs128(
+    path: Path, start: int, record: np.dtype[np.void], is_turned: bool, losses: Losses
+) -> Iterator[Events]:
+    """Address: polarity in bit 0, x in bits 1-7, y in bits 8-14; bit 15 is no pixel.
+
+    Files without a version are read too, so times must show that these are records.
+    """
     unwrapped = Unwrapped(32)
-    for block in blocks_of(path, start, 8, losses):
-        address, us = np.frombuffer(block, ">u4").reshape(-1, 2).T
-        t = unwrapped(us.astype(np.int64))
-        events = make_events(address >> 1 & 0x7F, address >> 8 & 0x7F, address & 1, t)
-        yield events[address >> 15 == 0]
+    n = falls = 0
+    for block in blocks_of(path, start, record.itemsize, losses):
+        records = np.frombuffer(block, record)
+        address = records["address"].astype(np.uint32)
+        t = unwrapped(records["us"].astype(np.int64))
+        n, falls = n + len(t), falls + int(np.count_nonzero(np.diff(t) < 0))
+        if falls > 1 + n // 8:
+            raise InputError(
+                f"{path}: time goes back {falls} times in the first {n} events; this is no such file, or it "
+                "is damaged"
+            )
+        x, y, p = address >> 1 & 0x7F, address >> 8 & 0x7F, address & 1
+        if is_turned:
+            x, y, p = _DVS128_SIDE - 1 - x, _DVS128_SIDE - 1 - y, 1 - p
+        yield make_events(x, y, p, t)[address >> 15 == 0]
 
 
 def _read_davis(path: Path, start: int, resolution: Resolution, losses: Losses) -> Iterator[Events]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.camera_files.columns import Rows, layout_of, named_fields
+from streamfeat.camera_files.columns import Rows, field_of, layout_of, named_fields
 from streamfeat.camera_files.source import (
     TIME_UNITS,
     Contents,
@@ -55,9 +55,11 @@ def open_numpy(path: Path, head: bytes, options: TableOptions) -> Contents:
         )
     streams = tuple(tables)
     columns, names = tables[streams[chosen_stream(path, streams, options.stream)]]
+    is_dated = any(column.dtype.kind in "mM" for column in columns)
+    columns = [_in_microseconds(column) for column in columns]
     if any(column.dtype.kind not in "biuf" for column in columns):
         raise InputError(f"{path}: columns x, y, p, t must be numbers")
-    said_unit = str(others.pop("t_unit", ""))
+    said_unit = "us" if is_dated else str(others.pop("t_unit", ""))
     size = others.pop("resolution", np.empty(0))
     layout = layout_of(path, columns, names, options, unit=said_unit if said_unit in TIME_UNITS else "")
     t, x, y, p = (columns[i] for i in layout.order)
@@ -79,7 +81,7 @@ def _npy(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _npz(path: Path) -> dict[str, NDArray[Any]]:
-    """All members that are arrays.
+    """All members that are arrays of numbers or text; of others those are left out that are no columns.
 
     Raises:
         InputError: one unpacks to more than is allowed.
@@ -92,8 +94,15 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
                 f"{LARGEST_UNPACKED}; "
                 "save its arrays as .npy, or in several files"
             )
+    arrays = {}
     with np.load(path, allow_pickle=False) as loaded:
-        arrays = {name: loaded[name] for name in loaded.files}
+        for name in loaded.files:
+            try:
+                arrays[name] = loaded[name]
+            except ValueError as error:
+                if "allow_pickle" not in str(error) or field_of(name)[0]:
+                    raise
+                # Something about the recording, perhaps; it is not needed, and never unpickled.
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise ValueError("a member is no array")
     return arrays
@@ -101,6 +110,9 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
 
 def _tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, _Table], dict[str, NDArray[Any]]]:
     """The arrays that are tables of events, by name, and the other arrays."""
+    if (pixels := arrays.get("xy")) is not None and pixels.ndim == 2 and pixels.shape[1] == 2:
+        x, y = pixels.T
+        arrays = {**{name: array for name, array in arrays.items() if name != "xy"}, "x": x, "y": y}
     fields, _ = named_fields([*arrays])
     if len(fields) == 4:
         by_name = {field: [*arrays][i] for field, i in fields.items()}
@@ -112,8 +124,8 @@ def _tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, _Table], dict
     others: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
         kinds, is_plain = array.dtype.names, array.ndim == 2 and array.dtype.kind in "biuf"
-        if kinds is not None and array.ndim == 1 and len(named_fields(kinds)[0]) == 4:
-            tables[name] = [array[kind] for kind in kinds], [*kinds]
+        if kinds is not None and array.shape[:1] == (array.size,) and len(named_fields(kinds)[0]) == 4:
+            tables[name] = [array[kind].reshape(-1) for kind in kinds], [*kinds]
         elif (
             kinds is None
             and array.ndim == 2
@@ -127,6 +139,13 @@ def _tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[dict[str, _Table], dict
         else:
             others[name] = array
     return tables, others
+
+
+def _in_microseconds(column: NDArray[Any]) -> NDArray[Any]:
+    """Dates and spans of time as whole microseconds, other columns as they are."""
+    return (
+        column.astype(f"{column.dtype.kind}8[us]").astype(np.int64) if column.dtype.kind in "mM" else column
+    )
 
 
 def _read(path: Path, unit: str, columns: dict[str, NDArray[Any]], losses: Losses) -> Iterator[Events]:

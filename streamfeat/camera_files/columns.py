@@ -35,21 +35,34 @@ SAMPLE_ROWS = 20_000
 """Rows from which order and unit are found."""
 
 _NAMES = {
-    "x": {"x", "xs", "xaddr", "xcoordinate", "xcoordinates", "xpos", "col", "column", "u"},
-    "y": {"y", "ys", "yaddr", "ycoordinate", "ycoordinates", "ypos", "row", "v"},
+    "x": {
+        "x",
+        "xs",
+        "xaddr",
+        "xcoord",
+        "xcoords",
+        "xcoordinate",
+        "xcoordinates",
+        "xpos",
+        "col",
+        "column",
+        "u",
+    },
+    "y": {"y", "ys", "yaddr", "ycoord", "ycoords", "ycoordinate", "ycoordinates", "ypos", "row", "v"},
     "p": {"p", "ps", "pol", "pols", "polarity", "polarities", "on", "sign", "ison"},
     "t": {"t", "ts", "time", "times", "timestamp", "timestamps", "tus", "tns", "tms"},
 }
 _UNIT_NAMES = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "usecs", "micros", "µs", "μs", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"), "ns"),
 }
 _ORDERS = ("txyp", "xytp", "xypt", "tpxy", "pxyt", "ptxy")
 _IN_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _NAME = re.compile(
-    r"(?:event_|events?/)?([a-z]+?)(?:[ _]*[\[(]\s*([a-z\u00b5\u03bc]+)\s*[\])]|[ _]+([a-z\u00b5\u03bc]+))?"
+    r"(?:event_|events?/|pixel_|addr_)?([a-z]+?)"
+    r"(?:[ _]*[\[(]\s*([a-z\u00b5\u03bc]+)\s*[\])]|[ _]+([a-z\u00b5\u03bc]+))?"
 )
 _LEAST_RATE = 100  # events a second; of noise alone, a sensor of 128x128 pixels gives ten times as many
 _LEAST_ROWS = 50  # to know a rate, or an order by its falls
@@ -68,10 +81,13 @@ class Layout:
 def field_of(name: str) -> tuple[str, str]:
     """Which of t, x, y, p a column of this name is, or "", and the unit that the name says, or "".
 
-    Case, quotes and what follows an @ (faery's `x@640`) mean nothing; a unit may follow in brackets or after
-    an underscore.
+    Case, quotes and what follows an @ (faery's `x@640`) mean nothing; a unit may follow in brackets, after an
+    underscore or as a word (`timestampUs`), or stand alone.
     """
-    text = name.strip().strip("\"'").strip().lower().partition("@")[0]
+    text = name.strip().strip("\"'").strip().partition("@")[0]
+    text = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", text).lower()
+    if len(text) > 1 and text in _UNIT_NAMES:
+        return "t", _UNIT_NAMES[text]
     match = _NAME.fullmatch(text)
     if match is None:
         return "", ""
@@ -87,12 +103,16 @@ def field_of(name: str) -> tuple[str, str]:
 
 
 def named_fields(names: Sequence[str]) -> tuple[dict[str, int], str]:
-    """Positions of the names that are t, x, y, p, the first of each, and the unit that is said, or ""."""
+    """Positions of the names that are t, x, y, p, the first of each, and the unit that is said, or "".
+
+    Seconds and what is beyond them in columns of their own are no column of time.
+    """
     fields: dict[str, int] = {}
     unit = ""
+    parts = [name for name in names if field_of(name)[0] == "t" and name.strip("\"' ").lower() in _UNIT_NAMES]
     for i, name in enumerate(names):
         field, said = field_of(name)
-        if field and field not in fields:
+        if field and field not in fields and (name not in parts or len(parts) == 1):
             fields[field] = i
             unit = said or unit
     return fields, unit
@@ -246,8 +266,9 @@ class Rows:
             columns: t, x, y, p, each `(n,)` numbers, not changed.
 
         Raises:
-            InputError: a value is none that an event can have.
+            InputError: a value is out of the range that events have.
         """
+        columns = {name: _exact(column) for name, column in columns.items()}
         t = _microseconds(columns["t"], self._unit)
         # Fractions stay, to be refused below, and whole numbers whole.
         values = {"t": (t.astype(np.int64) if t.dtype.kind in "iu" else t) + self._offset_us}
@@ -281,6 +302,11 @@ class Rows:
                 f"{self._path}: polarity is -1 at event {self._minus} and 0 at event {self._zero}: one of "
                 "them is OFF, but which? Write 0 and 1, or -1 and 1"
             )
+
+
+def _exact(column: NDArray[Any]) -> NDArray[Any]:
+    """Floats as they are, but in a type that holds every limit they are compared with."""
+    return column.astype(np.float64) if column.dtype.kind == "f" and column.dtype.itemsize < 8 else column
 
 
 def _microseconds(t: NDArray[Any], unit: str) -> NDArray[Any]:

@@ -5,16 +5,18 @@ Not here: the formats themselves (`prophesee`, `aedat`, `text`, ...), folders an
 (`streamfeat.convert.datasets`), and MCAP (`streamfeat.recordings.reader`).
 """
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from streamfeat.camera_files.aedat import open_aedat2, open_aedat3
+from streamfeat.camera_files.aedat import open_aedat1, open_aedat2, open_aedat3
 from streamfeat.camera_files.aedat4 import open_aedat4
 from streamfeat.camera_files.arrays import open_numpy
 from streamfeat.camera_files.containers import open_hdf5
+from streamfeat.camera_files.event_stream import open_event_stream
 from streamfeat.camera_files.prophesee import (
     encoding_of_header,
     open_bin40,
@@ -45,17 +47,33 @@ FORMATS = {
     "evt21": "Prophesee EVT 2.1 .raw",
     "evt3": "Prophesee EVT 3.0 .raw",
     "evt4": "Prophesee EVT 4.0 .raw",
-    "aedat2": "AEDAT 2.0 .aedat",
+    "aedat1": "AEDAT 1.0 .aedat (DVS128)",
+    "aedat2": "AEDAT 2.0 .aedat (DVS128, DAVIS)",
     "aedat3": "AEDAT 3.1 .aedat",
     "aedat4": "AEDAT 4 .aedat4",
+    "es": "Event Stream 2 .es (DVS, ATIS)",
     "hdf5": "HDF5 .h5/.hdf5 (Prophesee, DSEC, M3ED, MVSEC, e2vid, v2e)",
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
-    "text": "text .txt/.csv (t x y p)",
+    "text": "text .txt/.csv/.tsv (t x y p)",
 }
-"""What can be read, by the name that `open_events` takes."""
+"""Formats that can be read, by the name that `open_events` takes."""
 
 EXTENSIONS = frozenset(
-    [".dat", ".bin", ".raw", ".aedat", ".aedat4", ".h5", ".hdf5", ".npz", ".npy", ".txt", ".csv"]
+    [
+        ".dat",
+        ".bin",
+        ".raw",
+        ".aedat",
+        ".aedat4",
+        ".es",
+        ".h5",
+        ".hdf5",
+        ".npz",
+        ".npy",
+        ".txt",
+        ".csv",
+        ".tsv",
+    ]
 )
 """Endings, lower case, of files in which events are looked for."""
 
@@ -227,7 +245,7 @@ def _find_format(path: Path, head: bytes) -> str:
             return name
     if head.startswith(b"\x89MCAP0\r\n"):
         raise InputError(f"{path}: is an MCAP recording already; no conversion is needed")
-    if ending in (".txt", ".csv"):
+    if ending in (".txt", ".csv", ".tsv"):
         return "text"
     if head.startswith((b"\x93NUMPY", b"PK\x03\x04")) and ending in (".npy", ".npz"):
         return "numpy"
@@ -239,14 +257,23 @@ def _find_format(path: Path, head: bytes) -> str:
             return "dat"
     if ending == ".bin":
         return "bin40"
+    if ending == ".aedat" and not head.startswith(b"#!AER-DAT"):
+        return "aedat1"
+    if _TEXT.fullmatch(head[:1000]):
+        return "text"
     raise InputError(f"{path}: not a known event file; known are {'; '.join(FORMATS.values())}")
 
 
+_TEXT = re.compile(rb"(?:\xef\xbb\xbf)?[\t\n\r -~]*\d[\t\n\r -~]*")
+"""What a file without a known ending begins with, if it is lines of numbers."""
+
 _MAGIC = {
+    b"#!AER-DAT1": "aedat1",
     b"#!AER-DAT2": "aedat2",
     b"#!AER-DAT3": "aedat3",
     b"#!AER-DAT4": "aedat4",
     b"\x89HDF\r\n\x1a\n": "hdf5",
+    b"Event Stream": "es",
 }
 
 _OPENERS: dict[str, _Open] = {
@@ -256,9 +283,11 @@ _OPENERS: dict[str, _Open] = {
     "evt21": open_evt21,
     "evt3": open_evt3,
     "evt4": open_evt4,
+    "aedat1": open_aedat1,
     "aedat2": open_aedat2,
     "aedat3": open_aedat3,
     "aedat4": open_aedat4,
+    "es": open_event_stream,
     "hdf5": open_hdf5,
     "numpy": open_numpy,
     "text": open_text,

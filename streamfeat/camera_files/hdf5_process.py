@@ -7,8 +7,9 @@ The HDF5 library trusts what it reads: a few changed bytes make it loop without 
 mended from outside, so it happens here, where it costs a process.
 
 What is written is a row of frames, each a kind (one byte), a length (int64) and so many bytes: what the file
-says (`i`, JSON); for each block of rows its columns (`c`, each as `.npy`) and an end (`b`); last, one of
-end of file (`z`), refused (`r`) and damaged (`d`), these with a reason.
+says (`i`, JSON); for each block of rows its columns (`c`, each as `.npy`) and an end (`b`), or one chunk of
+ECF as it is stored (`e`); last, one of end of file (`z`), refused (`r`) and damaged (`d`), these two with a
+reason.
 """
 
 import contextlib
@@ -29,13 +30,17 @@ from streamfeat.camera_files.columns import field_of, named_fields
 from streamfeat.camera_files.source import chosen_stream
 from streamfeat.errors import InputError
 
-__all__ = ["FRAME", "serve"]
+__all__ = ["ECF_FILTER", "FRAME", "ROWS", "serve"]
 
 FRAME = struct.Struct("<cq")
+ROWS = struct.Struct("<q")
+"""What stands before a chunk of ECF: how many of its rows belong to the table."""
+ECF_FILTER = 0x8ECF
 
 _MOST_OBJECTS, _DEEPEST = 2_000, 5  # that are looked at to find events
 _BLOCK_BYTES = 4 << 20
 _CHUNK_BYTES = 64 << 20  # a chunk is unpacked whole; Prophesee writes 16,384 events in each
+_ECF_BYTES = 12 + 65_535 * 9  # a chunk at its largest
 _SQUEEZE = 2048  # rows may take so many times their bytes in the file: deflate saves at most 1032
 _ROOM_BYTES = 1 << 30
 _OPEN_S, _BLOCK_S = 1.0, 5.0  # of the processor: a thousand times what they take
@@ -61,6 +66,10 @@ def serve(path: Path, stream: str, out: BinaryIO) -> None:
             if len({len(dataset) for dataset in datasets}) > 1:
                 raise InputError(f"{name}: its tables differ in length; the file is cut short or damaged")
             _say(out, b"i", json.dumps(_about(h5py, root, name, tables, names, assumptions)).encode())
+            if _filters(datasets[0]) == [ECF_FILTER]:
+                _say_chunks(out, datasets[0])
+                _say(out, b"z", b"")
+                return
             size = sum(dataset.dtype.itemsize * math.prod(dataset.shape[1:]) for dataset in datasets)
             step = max(1, _BLOCK_BYTES // max(size, 1))
             for row in range(0, len(datasets[0]), step):
@@ -95,6 +104,24 @@ def _say_rows(out: BinaryIO, parts: list[Any]) -> None:
     _say(out, b"b", b"")
 
 
+def _say_chunks(out: BinaryIO, dataset: Any) -> None:
+    """The chunks of a table whose only filter is ECF, each with how many of its rows are in the table."""
+    length = dataset.chunks[0]
+    for row in range(0, len(dataset), length):
+        _limit(_BLOCK_S)
+        info = dataset.id.get_chunk_info_by_coord((row,))
+        if not 0 < info.size <= _ECF_BYTES or info.filter_mask:
+            raise ValueError(f"a chunk of ECF of {info.size} bytes at row {row}")
+        _, data = dataset.id.read_direct_chunk((row,))
+        _say(out, b"e", ROWS.pack(min(length, len(dataset) - row)) + data)
+
+
+def _filters(dataset: Any) -> list[int]:
+    """Codes of the filters of a table, in the order in which they were applied."""
+    filters = dataset.id.get_create_plist()
+    return [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
+
+
 _Tables = dict[str, tuple[list[Any], list[str] | None]]
 
 
@@ -123,7 +150,7 @@ def _tables(h5py: Any, root: Any) -> tuple[_Tables, list[str]]:
             elif isinstance(thing, h5py.Dataset) and thing.ndim == 2 and thing.shape[1] == 4:
                 if "event" in key.lower() or name == key:
                     tables[name] = [thing], None
-            elif isinstance(thing, h5py.Dataset) and thing.ndim == 1:
+            elif isinstance(thing, h5py.Dataset) and (thing.ndim == 1 or thing.shape[1:] == (1,)):
                 field, _ = field_of(key)
                 if field and field not in found:
                     found[field] = (key, thing)
@@ -188,21 +215,21 @@ def _about(
 def _check(h5py: Any, root: Any, dataset: Any) -> None:
     """Refuse a dataset that is not in this file, whose codec is missing, or that claims too much.
 
-    A dataset may say that its bytes are in any other file, and claim any number of rows that nobody wrote.
+    A dataset may say that its bytes are in any other file, and claim rows that were never written.
     """
     if dataset.external or dataset.is_virtual or dataset.file.filename != root.filename:
         raise InputError("keeps its events in another file; convert that one")
     filters = dataset.id.get_create_plist()
     for code, name in ((f[0], f[3]) for f in map(filters.get_filter, range(filters.get_nfilters()))):
-        if not h5py.h5z.filter_avail(code):
-            remedy = (
-                "for ECF build github.com/prophesee-ai/hdf5_ecf and set HDF5_PLUGIN_PATH; hdf5plugin lacks it"
-                if code == 36559
-                else "pip install 'streamfeat[convert]' has Blosc, LZ4, Zstandard and others"
-            )
+        if code == ECF_FILTER:
+            if _filters(dataset) != [code] or dataset.dtype.names != ("x", "y", "p", "t"):
+                raise InputError(
+                    "is compressed with ECF, but is no table of x, y, p, t with this filter alone"
+                )
+        elif not h5py.h5z.filter_avail(code):
             raise InputError(
                 f"is compressed with HDF5 filter {code} ({name.decode('ascii', 'replace')}), which is not "
-                f"installed; {remedy}"
+                "installed; pip install 'streamfeat[convert]' has Blosc, LZ4, Zstandard and others"
             )
     stored = dataset.id.get_storage_size()
     row = dataset.dtype.itemsize

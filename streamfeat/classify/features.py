@@ -1,6 +1,6 @@
 """Features of many samples at once, for training and evaluation.
 
-Lives here: `EventFeatures`, the scikit-learn transformer; encoding samples on all cores; mirrored samples.
+Lives here: `EventFeatures`, the scikit-learn transformer; encoding samples on all cores.
 Not here: streams (`engine`), and what one window's features are (`window`).
 """
 
@@ -8,7 +8,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Self, TypeVar
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 
+from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
@@ -27,7 +28,6 @@ __all__ = [
     "EventFeatures",
     "encode_recordings",
     "encode_samples",
-    "mirrored",
     "sample_end",
     "training_set",
 ]
@@ -74,16 +74,6 @@ def _mapped(function: Callable[[T], R], values: Iterable[T], threads: int | None
             ahead.extend(pool.submit(function, value) for value in islice(source, 1))
 
 
-def mirrored(sample: Sample) -> Sample:
-    """The sample as it would look in a mirror: columns from right to left.
-
-    An event outside the sensor stays outside: `x` is unsigned and wraps.
-    """
-    events = sample.events.copy()
-    events["x"] = np.uint16(sample.resolution[1] - 1) - events["x"]
-    return replace(sample, events=events)
-
-
 @dataclass(frozen=True, slots=True)
 class EncodedSamples:
     """Features of labelled samples in the order of the stream.
@@ -91,7 +81,7 @@ class EncodedSamples:
     Attributes:
         rows: `(n, F)` float32.
         labels: `(n,)` names.
-        sources: `(n,)` texts, what the labels say that samples are from.
+        sources: `(n,)` texts, the sources of the samples according to their labels.
         held_out: `(n,)` bool, whether a sample is of a held-out split.
     """
 
@@ -106,24 +96,24 @@ def encode_recordings(
     recordings: Sequence[Recording],
     report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
     *,
-    mirror: bool = False,
+    variant: Variant = PLAIN,
     workers: Workers = THIS_PROCESS,
 ) -> EncodedSamples:
-    """Encode all labelled samples of recordings, or the mirror images of those that are not held out.
+    """Encode all labelled samples of recordings, or a variant of those that are not held out.
 
     Args:
         encoder: the frozen encoder.
         recordings: open recordings.
         report: called with (step, done, of how many, remark).
-        mirror: encode mirror images, of training samples only.
+        variant: other than `PLAIN`, it is encoded of training samples only.
         workers: read and encode.
     """
     labels: list[Label] = []
     rows: list[NDArray[np.float32]] = []
-    step = "encoding mirrored" if mirror else "encoding"
+    step = "encoding" if variant == PLAIN else f"encoding, {variant}"
     for recording in recordings:
         losses, parts = Losses(), [(recording.part(part),) for part in recording.parts()]
-        found = workers.map(_encode_part, parts, workers.hold(encoder), mirror)
+        found = workers.map(_encode_part, parts, workers.hold(encoder), variant)
         for done, (names, encoded, lost) in enumerate(found, 1):
             labels += names
             rows.append(encoded)
@@ -139,12 +129,12 @@ def encode_recordings(
 
 
 def _encode_part(
-    opener: Callable[[], Recording], encoder: FeatureMap, mirror: bool
+    opener: Callable[[], Recording], encoder: FeatureMap, variant: Variant
 ) -> tuple[list[Label], NDArray[np.float32], Losses]:
     with opener() as recording:
         samples = recording.samples()
-        if mirror:
-            samples = (mirrored(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
+        if variant != PLAIN:
+            samples = (variant.of(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
         encoded = [*encode_samples(encoder, samples, threads=1)]
         rows = np.empty((len(encoded), encoder.n_features), np.float32)
         for row, (_, features) in zip(rows, encoded, strict=True):
@@ -153,20 +143,21 @@ def _encode_part(
 
 
 def training_set(
-    samples: EncodedSamples, images: EncodedSamples | None
+    samples: EncodedSamples, others: Sequence[EncodedSamples] = ()
 ) -> tuple[NDArray[np.float32], list[str], NDArray[np.int64]]:
-    """What a classifier is trained on: rows, labels, and the number of the sample that each is made of.
+    """Rows to train a classifier on, their labels, and the number of each row's sample.
 
     Args:
         samples: of which those that are not held out are taken.
-        images: mirror images of just those, if they are to be learned from as well.
+        others: variants of just those, which are learned from as well.
     """
     seen = ~samples.held_out
     rows, labels = samples.rows[seen], samples.labels[seen].tolist()
     numbers = np.arange(len(rows))
-    if images is None:
+    if not others:
         return rows, labels, numbers
-    return np.concatenate([rows, images.rows]), 2 * labels, np.tile(numbers, 2)
+    n = 1 + len(others)
+    return np.concatenate([rows, *(other.rows for other in others)]), n * labels, np.tile(numbers, n)
 
 
 class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -207,7 +198,7 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 `(height, width)`.
 
         Raises:
-            InputError: one of them is none of these, or an array has no resolution.
+            InputError: one of them is of another type, or an array has no resolution.
         """
         rows = list(_mapped(self._encode, enumerate(X), self.threads))
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)

@@ -1,26 +1,25 @@
-"""What this installation is, what it lacks, and whether it computes what it should, how fast.
+"""The state of this installation: versions, missing extras, exactness and speed.
 
 Lives here: versions against what the package asks for, extras, threads, kernels, a second of work.
 Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
 """
 
-import os
-import re
 import time
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, requires, version
-from pathlib import Path
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 import numpy as np
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events
-from streamfeat.kernels.ingest import count_events
+from streamfeat.kernels import cache
 from streamfeat.report.machine import Disturbance, describe_machine
 from streamfeat.simulate.saccades import CameraModel, digit_samples
 
@@ -39,10 +38,13 @@ EXTRAS = {
     "test": "the tests",
     "lint": "lint and types",
 }
-"""What each extra is for."""
+"""The purpose of each extra."""
 
 _VECTORS = ("sse4.2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "neon", "sve")
 _FILTERS = 400
+_GEOMETRY = Geometry(patch=12, stride=4, n_bins=3, bin_us=100_000, max_count=1)
+"""The default of `streamfeat learn`."""
+
 _SAMPLE_US = 1_000_000
 
 
@@ -87,8 +89,8 @@ def examine(progress: Callable[[str], None] = lambda step: None, *, seconds: flo
     report |= _work(progress, seconds)
     if not report["kernels"]["cached"]:
         problems.append(
-            f"compiled kernels cannot be kept in {report['kernels']['folder']}, so every start compiles them "
-            "again: set NUMBA_CACHE_DIR to a folder that can be written to"
+            "compiled kernels cannot be kept anywhere, so every start compiles them again: set "
+            "NUMBA_CACHE_DIR to a folder that can be written to"
         )
     if not report["exact"]:
         problems.append(
@@ -107,15 +109,14 @@ def _requirements() -> tuple[dict[str, tuple[str, str]], dict[str, dict[str, tup
     """Installed version ("" for none) and wanted range of each dependency; the same for each extra."""
     required: dict[str, tuple[str, str]] = {}
     extras: dict[str, dict[str, tuple[str, str]]] = {}
-    for line in requires("streamfeat") or []:
-        requirement, _, condition = line.partition(";")
-        match = re.match(r"\s*([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*(.*)", requirement)
-        extra = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", condition)
-        if not match:
+    for requirement in map(Requirement, requires("streamfeat") or []):
+        about = _installed(requirement.name), str(requirement.specifier)
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            required[requirement.name] = about
             continue
-        name, wanted = match[1], match[2].strip(" ()")
-        place = extras.setdefault(extra[1], {}) if extra else required
-        place[name] = _installed(name), wanted
+        for extra in metadata("streamfeat").get_all("Provides-Extra") or []:
+            if requirement.marker.evaluate({"extra": extra}):
+                extras.setdefault(extra, {})[requirement.name] = about
     return required, extras
 
 
@@ -127,27 +128,15 @@ def _installed(name: str) -> str:
 
 
 def _satisfies(found: str, wanted: str) -> bool:
-    """Whether a version is inside bounds such as `>=2.0,<3`; only the bounds that we use ourselves."""
-    if not found:
-        return False
-    for bound in filter(None, wanted.split(",")):
-        limit, mine = _numbers(bound), _numbers(found)
-        length = max(len(limit), len(mine))  # 2 is 2.0
-        limit, mine = (numbers + [0] * (length - len(numbers)) for numbers in (limit, mine))
-        if (mine < limit) if bound.strip().startswith(">=") else (mine >= limit):
-            return False
-    return True
-
-
-def _numbers(text: str) -> list[int]:
-    release = re.search(r"\d+(?:\.\d+)*", text)
-    return [int(part) for part in release[0].split(".")] if release else []
+    """Whether an installed version is inside bounds such as `>=2.0,<3`; "" is never."""
+    return bool(found) and SpecifierSet(wanted).contains(found, prereleases=True)
 
 
 def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:
     """Encode simulated digits both ways; then as many events as fit into the time."""
     progress("compiling kernels, if this is the first time")
-    encoder, events, resolution = _random_encoder(), _digit_events(), CameraModel().resolution
+    events, resolution = _digit_events(), CameraModel().resolution
+    encoder = random_encoder(0, _GEOMETRY, _FILTERS, encoding="split", threshold=0.3)
     started = time.perf_counter()
     feeding, following = Engine(encoder, resolution), Engine(encoder, resolution)
     feeding.feed(events)
@@ -172,9 +161,8 @@ def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:
 
 
 def _kernel_cache() -> dict[str, Any]:
-    folder = Path(count_events.stats.cache_path or "")
-    kept = bool(count_events.stats.cache_path) and os.access(folder, os.W_OK)
-    return {"folder": str(folder), "cached": kept}
+    folder = cache.folder()
+    return {"folder": str(folder or ""), "cached": folder is not None, "digest": cache.digest()}
 
 
 def _events_per_second(take: Callable[[Events], None], events: Events, seconds: float, *, size: int) -> float:
@@ -193,21 +181,3 @@ def _events_per_second(take: Callable[[Events], None], events: Events, seconds: 
 
 def _digit_events() -> Events:
     return next(iter(digit_samples(1, 0))).events
-
-
-def _random_encoder() -> Encoder:
-    """The default geometry of `streamfeat learn`, with filters that need no learning."""
-    geometry, rng = (
-        Geometry(patch=12, stride=4, n_bins=3, bin_us=100_000, max_count=1),
-        np.random.default_rng(0),
-    )
-    filters = rng.standard_normal((_FILTERS, geometry.entries))
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.3,
-        filters=filters / np.linalg.norm(filters, axis=1, keepdims=True),
-        whitening=np.eye(geometry.entries),
-        mean=np.zeros(geometry.entries),
-    )

@@ -6,7 +6,7 @@ Not here: the learning itself (`learn`, `classifier`).
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     print_losses,
     print_result,
     progress_bars,
@@ -41,7 +42,9 @@ if TYPE_CHECKING:
     from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
+    from streamfeat.learn.settings import Setting
     from streamfeat.recordings.options import ReadOptions
+    from streamfeat.recordings.reader import Recording
 
 __all__ = ["learn", "train"]
 
@@ -98,6 +101,8 @@ def learn(
 ) -> None:
     """Learn features without labels; samples of validation and test splits are not looked at.
 
+    Without --stride, --downsample and --preset the grid is the finest that one core follows on the sensor.
+
     Ctrl-C writes the model of the last whole iteration, from which --resume goes on; the exit status is 130.
     After a crash there is the file MODEL.part, which --resume takes as well.
     """
@@ -106,7 +111,7 @@ def learn(
     from streamfeat.learn.settings import Setting
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(model, overwrite=overwrite or model == resume)
+    refuse_existing(model, *recordings, overwrite=overwrite or model == resume)
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
@@ -116,6 +121,8 @@ def learn(
             for rec in opened:
                 print_assumptions(rec.assumptions)
             place = files.enter_context(working(cluster, workers, quiet=quiet))
+            if preset == "default" and stride is None and downsample is None:
+                setting = _suited(opened, setting)
             report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
             encoder = learn_encoder(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
@@ -133,7 +140,7 @@ def learn(
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
-        "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
+        "objective": [encoder.provenance["objective"][0], encoder.provenance["objective"][-1]],
         "condition": encoder.provenance["condition"][-1],
         "coherence": encoder.provenance["coherence"][-1],
         "unused": encoder.provenance["unused"],
@@ -141,10 +148,8 @@ def learn(
     }
     entries = encoder.geometry.entries
     if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
-        result["log_determinant"] = (
-            f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
-        )
-    print_result(result, "learned", as_json=as_json)
+        result["log_determinant"] = "A XX' A'"
+    print_result(result, "learned", as_json=as_json, command="learn")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
@@ -162,6 +167,20 @@ def learn(
             soft_wrap=True,
         )
         raise typer.Exit(130)
+
+
+def _suited(opened: "Sequence[Recording]", setting: "Setting") -> "Setting":
+    """The grid for the sensor, and a line where that is not the default one."""
+    from streamfeat.learn.sensor import suited_to
+
+    found = suited_to(opened, setting)
+    if (found.stride, found.downsample) != (setting.stride, setting.downsample):
+        err.print(
+            f"[dim]geometry:[/] --stride {found.stride} --downsample {found.downsample}, the finest that one "
+            "core follows with --emit 10ms on a sensor of this size; give either for another",
+            soft_wrap=True,
+        )
+    return found
 
 
 def _keeper(path: Path) -> "Keep":
@@ -185,11 +204,13 @@ def _keeper(path: Path) -> "Keep":
 def train(
     recordings: RecordingsArgument,
     reading: "ReadOptions",
-    model: ModelOption,
     classifier: Annotated[Path, typer.Option("--output", "-o", help="Classifier to write.")],
+    model: ModelOption = None,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.")] = 3,
     groups: options.Groups = "block",
     mirror: options.Mirror = False,
+    cuts: options.Cuts = "",
+    shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
     topic: TopicOption = None,
     cluster: ClusterOption = None,
@@ -206,14 +227,16 @@ def train(
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
     from streamfeat.classify.kernel import train_kernel_classifier
+    from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
-    refuse_existing(classifier, overwrite=overwrite)
+    refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     kind = groups_named(groups)
+    variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
     if kernel not in ("linear", "rbf"):
         raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
-    encoder = Encoder.load(model)
+    encoder = Encoder.load(model_or_general(model))
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
         for rec in opened:
@@ -228,14 +251,13 @@ def train(
         samples = encode_recordings(encoder, opened, report, workers=place)
         if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
-        images = encode_recordings(encoder, opened, report, mirror=True, workers=place) if mirror else None
+        others = [encode_recordings(encoder, opened, report, variant=v, workers=place) for v in variants]
         report("training", 0, 0, f"{folds}-fold cross-validation")
-        rows, labels, numbers = training_set(samples, images)
+        rows, labels, numbers = training_set(samples, others)
         sources = samples.sources[~samples.held_out].tolist()
         parts = assign_folds(labels[: len(sources)], sources, folds, kind)
-        trained = train_classifier(
-            rows, labels, encoder, parts=parts[numbers], provenance={"mirror": mirror, "groups": kind}
-        )
+        made_from = {"variants": [str(v) for v in variants], "groups": kind}
+        trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
     found: Classifier | KernelClassifier = trained
     if kernel == "rbf":
         found = train_kernel_classifier(rows, trained, np.asarray(labels))
@@ -243,7 +265,7 @@ def train(
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
-        "labels": ", ".join(trained.labels),
+        "labels": list(trained.labels),
         "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
@@ -253,7 +275,7 @@ def train(
         predicted = [found.predict(row) for row in held_out]
         share = (samples.labels[samples.held_out] == predicted).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
-    print_result(result, "trained", as_json=as_json)
+    print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)

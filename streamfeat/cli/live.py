@@ -27,7 +27,9 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     out,
+    print_json,
     print_losses,
     print_result,
     progress_bars,
@@ -83,8 +85,8 @@ def names_of(key: str | None, ros2: str | None, domain: int) -> "Names":
     "-c recordings/digits_classifier.safetensors"
 )
 def listen(
-    model: ModelOption,
     key: KeyArgument = None,
+    model: ModelOption = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
@@ -152,8 +154,9 @@ def listen(
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, model, classifier, state, overwrite=overwrite)
     names = names_of(key, ros2, domain)
+    chosen = model_or_general(model)
     common: dict[str, Any] = {
         "emit": emit,
         "learn_online": learn_online,
@@ -170,11 +173,11 @@ def listen(
                 "the network: leave out --output, --json-lines, --table and --metrics, or use `record`"
             )
         common["threads"] = 1 if threads is None else threads  # its workers are as many as there are cores
-        _spread(names, model, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
+        _spread(names, chosen, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
     share = Shard.parse(shard) if shard is not None else None
     job = ListenJob(
-        names, model, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
+        names, chosen, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
     )
     to_terminal = str(json_lines) == "-"
     job.run(
@@ -188,7 +191,7 @@ def listen(
         )
     )
     if not to_terminal:
-        print_result(job.result(), "heard", as_json=as_json)
+        print_result(job.result(), "heard", as_json=as_json, command="listen")
 
 
 def _spread(
@@ -210,10 +213,7 @@ def _spread(
         job = ClusterListen(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
         job.run()
     result = job.result()
-    of_each = result.pop("of_each")
-    if as_json:
-        result["of_each"] = of_each
-    print_result(result, names.expression, as_json=as_json)
+    print_result(result, names.expression, as_json=as_json, command="listen --cluster")
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
@@ -268,7 +268,7 @@ def publish(
     print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "published", as_json=as_json)
+    print_result(job.result(), "published", as_json=as_json, command="publish")
 
 
 @app.command(epilog="Example: streamfeat record 'robot/*/events' -o drive.mcap")
@@ -305,7 +305,7 @@ def record(
     )
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "recorded", as_json=as_json)
+    print_result(job.result(), "recorded", as_json=as_json, command="record")
 
 
 @app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
@@ -325,7 +325,7 @@ def recover(
     with progress_bars(quiet=quiet) as report:
         losses = recover_recording(source, target, overwrite=overwrite, report=report)
     result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
-    print_result(result, "recovered", as_json=as_json)
+    print_result(result, "recovered", as_json=as_json, command="recover")
     print_losses(losses)
 
 
@@ -346,7 +346,7 @@ def topics(
     with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
     if as_json:
-        print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)
+        print_json("topics", {"topics": [asdict(topic) for topic in found]})
         return
     for topic in found:
         where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"

@@ -5,7 +5,6 @@ Not here: the measurements (`latency`).
 """
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +26,9 @@ from streamfeat.cli.program import (
     app,
     completing,
     err,
+    model_or_general,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
 )
@@ -51,8 +52,14 @@ def latency(
     recording: RecordingArgument,
     reading: "ReadOptions",
     models: Annotated[
-        list[Path], typer.Option("--model", "-m", help="Model, from `streamfeat learn`; may be repeated.")
-    ],
+        list[Path] | None,
+        typer.Option(
+            "--model",
+            "-m",
+            help="Model, from `streamfeat learn`; may be repeated.",
+            show_default="the general one",
+        ),
+    ] = None,
     emit: Annotated[
         list[str],
         typer.Option(
@@ -88,10 +95,10 @@ def latency(
 
     if plot:
         check_picture(plot)
-        refuse_existing(plot, overwrite=overwrite)
+        refuse_existing(plot, recording, *(models or ()), overwrite=overwrite)
     report = LatencyReport(
         recording,
-        models,
+        models or [model_or_general(None)],
         emit,
         topic=topic,
         reading=reading,
@@ -114,7 +121,7 @@ def latency(
     except KeyboardInterrupt:  # before there is anything to show, or for the second time
         raise typer.Exit(130) from None
     if as_json:
-        typer.echo(json.dumps(report.result()))
+        print_json("latency", report.result())
     else:
         _print(report)
     if plot and report.rows:

@@ -15,6 +15,7 @@ __all__ = [
     "Bins",
     "Coherence",
     "Conditioning",
+    "Cuts",
     "Downsample",
     "Encoding",
     "Filters",
@@ -30,6 +31,7 @@ __all__ = [
     "Preset",
     "Rows",
     "Seed",
+    "Shift",
     "Start",
     "Stride",
     "Threshold",
@@ -40,7 +42,7 @@ __all__ = [
 
 
 def _shown(name: str) -> str:
-    """What `--help` says of the value that an option has if it is not given."""
+    """The default of an option as `--help` shows it."""
     return str((DEFAULTS | PRESETS["default"])[name])
 
 
@@ -140,6 +142,20 @@ Mirror = Annotated[
     bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")
 ]
 
+Cuts = Annotated[
+    str,
+    typer.Option(
+        metavar="MS+MS",
+        help="Train the classifier on the beginnings of its samples as well, such as 33+67: so it decides "
+        "early.",
+    ),
+]
+Shift = Annotated[
+    int,
+    typer.Option(
+        min=0, help="Train the classifier on samples moved by so many pixels to each of four sides as well."
+    ),
+]
 
 Kernel = Annotated[
     str,

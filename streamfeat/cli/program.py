@@ -1,4 +1,4 @@
-"""What all commands share.
+"""The common part of all commands.
 
 Lives here: the program itself, arguments and options that several commands have, bars, tables, refusals.
 Not here: the commands.
@@ -6,13 +6,14 @@ Not here: the commands.
 
 import contextlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -28,7 +29,9 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from streamfeat.cli.results import RESULTS, complete, for_people
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import is_replaced, refuse_input
 from streamfeat.files.locations import Location, location_of
 
 if TYPE_CHECKING:
@@ -54,6 +57,7 @@ __all__ = [
     "completing",
     "err",
     "out",
+    "print_json",
     "print_losses",
     "print_result",
     "progress_bars",
@@ -61,7 +65,9 @@ __all__ = [
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "train", "replay", "evaluate", "latency", "view")
+_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
+_PIPE_COLUMNS = 1_000
+_PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
@@ -89,8 +95,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-out = Console(highlight=False, emoji=False)
-err = Console(stderr=True, highlight=False, emoji=False)
+
+class _WholeConsole(Console):
+    """A console that cuts nothing where it is no terminal: what reads a pipe or a file has room."""
+
+    @property  # type: ignore[misc]
+    def size(self) -> ConsoleDimensions:
+        size = super().size
+        cuts = self.is_terminal or "COLUMNS" in os.environ
+        return size if cuts else ConsoleDimensions(_PIPE_COLUMNS, size.height)
+
+
+out = _WholeConsole(highlight=False, emoji=False)
+err = _WholeConsole(stderr=True, highlight=False, emoji=False)
 
 
 @app.callback()
@@ -142,8 +159,8 @@ TopicOption = Annotated[
 EmitOption = Annotated[
     str,
     typer.Option(
-        help="When to emit features: event, 1000ev, 10ms or auto.",
-        autocompletion=completing("event", "1000ev", "10ms", "auto"),
+        help="When to emit features: event, 1000ev, 10ms, bin (of the model) or auto.",
+        autocompletion=completing("event", "1000ev", "10ms", "bin", "auto"),
     ),
 ]
 SpeedOption = Annotated[
@@ -159,7 +176,10 @@ ThreadsOption = Annotated[
         show_default="all cores but one",
     ),
 ]
-ModelOption = Annotated[Path, typer.Option("--model", "-m", help="Model, from `streamfeat learn`.")]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Show every sample.")]
@@ -282,6 +302,19 @@ def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterato
         yield found
 
 
+def model_or_general(model: Path | None) -> Path:
+    """The model that was given; without one the general model, which is said on standard error."""
+    from streamfeat.shipped.general import GENERAL_MODEL
+
+    if model is None:
+        err.print(
+            "[dim]model:[/] the general one that ships; filters learned from your own recordings fit them "
+            "better: `streamfeat learn`, then -m",
+            soft_wrap=True,
+        )
+    return model or GENERAL_MODEL
+
+
 def print_losses(losses: "Losses") -> None:
     """Say what of a recording could not be read."""
     for reason, count in losses.counts.items():
@@ -292,25 +325,35 @@ def print_losses(losses: "Losses") -> None:
         )
 
 
-def print_result(result: dict[str, Any], title: str, *, as_json: bool) -> None:
-    """Print a result as a table of two columns, or as JSON."""
+def print_result(result: dict[str, Any], title: str, *, as_json: bool, command: str = "") -> None:
+    """Print a result as a table of two columns, or as JSON.
+
+    Args:
+        result: its fields; those of the command that are missing are null in JSON.
+        title: of the table.
+        as_json: print JSON.
+        command: whose fields these are, see `results`; a table only, if it is none.
+    """
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json(command, result)
         return
     table = Table(title=title, show_header=False, title_justify="left", box=None, pad_edge=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")  # or a long path would lose its end in a narrow terminal
-    for name, value in result.items():
-        text = f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
-        table.add_row(name.replace("_", " "), escape(text))
+    for name, text in for_people(result, RESULTS.get(command, {})):
+        table.add_row(name, escape(text))
     out.print(table)
 
 
-def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file unless asked to, before any work is done."""
-    if path.exists() and not overwrite:
+def print_json(command: str, result: dict[str, Any]) -> None:
+    """Print the fields of a command's result as one line of JSON."""
+    typer.echo(json.dumps(complete(command, result), allow_nan=False))
+
+
+def refuse_existing(path: Path, *inputs: object, overwrite: bool) -> None:
+    """Refuse to replace a file unless asked to, and an input in any case, before any work is done."""
+    refuse_input(path, inputs)
+    if is_replaced(path) and path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; give another name or --overwrite")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the name of a file")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")

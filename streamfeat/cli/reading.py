@@ -54,7 +54,11 @@ _OPTIONS: dict[str, Any] = {
         str | None, typer.Option(metavar="WxH", help="Of the sensor, where a camera file does not say it.")
     ],
     "labels": Annotated[
-        str | None, typer.Option(metavar="FILE.csv", help="Labels for the recording: start,end,label.")
+        str | None,
+        typer.Option(
+            metavar="FILE.csv|TOPIC",
+            help="Labels for the recording: a table start,end,label, or one of its topics (std_msgs/String).",
+        ),
     ],
     "hot_pixels": HotPixels,
     "refractory": Refractory,

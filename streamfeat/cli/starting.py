@@ -4,7 +4,6 @@ Lives here: their arguments, and how their results are shown.
 Not here: what they do (`demo`, `doctor`).
 """
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +18,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_json,
     print_result,
     progress_bars,
 )
@@ -71,9 +71,9 @@ def demo(
         "seconds": round(time.monotonic() - started, 1),
     }
     if as_json:
-        typer.echo(json.dumps(result | {"next": job.commands()}))
+        print_json("demo", result | {"next": job.commands()})
     else:
-        print_result(result, "demonstrated", as_json=False)
+        print_result(result, "demonstrated", as_json=False, command="demo")
         out.print("\n[bold]try next[/]")
         for command in job.commands():
             typer.echo(command)  # as it is, for it is to be copied
@@ -92,7 +92,7 @@ def doctor(as_json: JsonOption = False) -> None:
     with progress_bars() as report:
         found = examine(lambda step: report("looking", 0, 0, step))
     if as_json:
-        typer.echo(json.dumps(found))
+        print_json("doctor", found)
     else:
         print_result(_overview(found), "this machine", as_json=False)
         out.print()
@@ -114,7 +114,8 @@ def _overview(found: dict[str, Any]) -> dict[str, Any]:
         "vectors": ", ".join(found["vectors"]) or "none",
         "threads": f"{found['threads']['numba']}, layer {found['threads']['layer']}",
         **{name: about["installed"] or "missing" for name, about in found["required"].items()},
-        "kernels": f"{'kept in' if kernels['cached'] else 'cannot be kept in'} {kernels['folder']}",
+        "kernels": f"of sources {kernels['digest']}, "
+        + (f"kept in {kernels['folder']}" if kernels["cached"] else "kept nowhere"),
         "first_use": f"{kernels['first_use_s']} s",
         "exact": "yes: stream and offline features have the same bits" if found["exact"] else "no",
         "feeding": f"{speed['events_per_s']:,} events a second",

@@ -1,7 +1,7 @@
 """Commands that run the main job: replay.
 
 Lives here: their arguments, and how their results are shown.
-Not here: the job (`replay`).
+Not here: the job (`stream.replay`).
 """
 
 import sys
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from streamfeat.cli.program import (
     EmitOption,
@@ -22,6 +23,8 @@ from streamfeat.cli.program import (
     TopicOption,
     VerboseOption,
     app,
+    err,
+    model_or_general,
     out,
     print_losses,
     print_result,
@@ -43,12 +46,12 @@ __all__ = ["replay"]
 @reads_recordings()
 def replay(
     recording: RecordingArgument,
-    model: ModelOption,
     reading: "ReadOptions",
+    model: ModelOption = None,
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: EmitOption = "auto",
+    emit: EmitOption = "bin",
     speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
@@ -79,10 +82,10 @@ def replay(
 
     for path in (output, json_lines, table):
         if path and str(path) != "-":
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, recording, model, classifier, overwrite=overwrite)
     job = ReplayJob(
         recording,
-        model,
+        model_or_general(model),
         classifier,
         emit=emit,
         speed=parse_speed(speed),
@@ -107,7 +110,9 @@ def replay(
             report,
         )
     if not to_terminal:
-        print_result(job.result(), "replayed", as_json=as_json)
+        print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
+    for line in job.advice:
+        err.print(f"[yellow]too much work:[/] {escape(line)}", soft_wrap=True)
     if job.interrupted:
         raise typer.Exit(130)

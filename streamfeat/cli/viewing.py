@@ -20,6 +20,7 @@ from streamfeat.cli.program import (
     TopicOption,
     app,
     err,
+    model_or_general,
     print_result,
     refuse_existing,
 )
@@ -49,6 +50,9 @@ def view(
         Path | None,
         typer.Option("--classifier", "-c", help="Show predictions, too, of this classifier."),
     ] = None,
+    features: Annotated[
+        bool, typer.Option("--features", help="Show features of the general model, where no -m is given.")
+    ] = False,
     emit: EmitOption = "auto",
     web: Annotated[
         bool | None,
@@ -104,7 +108,7 @@ def view(
         require("foxglove", extra="view", what="Foxglove and -o" if foxglove else "-o")
     for path in (output, layout):
         if path:
-            refuse_existing(path, overwrite=overwrite)
+            refuse_existing(path, source, model, classifier, overwrite=overwrite)
     recording = _recording(source)
     on_page = web if web is not None else not (foxglove or output)
     if not (on_page or foxglove or output):
@@ -123,7 +127,7 @@ def view(
         options = {"network": Network(zenoh_config, zenoh_port), "console": err}
     job = View(
         recording or names_of(source, ros2, domain),
-        model,
+        model_or_general(model) if model or features or classifier else None,
         classifier,
         emit=emit,
         rate=rate,
@@ -140,7 +144,7 @@ def view(
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     job.run()
-    print_result(job.result(), "viewed", as_json=as_json)
+    print_result(job.result(), "viewed", as_json=as_json, command="view")
 
 
 def _recording(source: str | None) -> Location | None:

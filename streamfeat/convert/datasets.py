@@ -5,33 +5,35 @@ Not here: the formats of single files (`event_files`) and MCAP itself (`streamfe
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from streamfeat.camera_files.event_files import EXTENSIONS, open_events
+from streamfeat.camera_files.event_files import EXTENSIONS
+from streamfeat.convert.sample_files import RECORDED, bytes_of, is_recorded, open_sample
 from streamfeat.convert.splits import SamplePath, hold_out_block, interleave, split_named, spread
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.locations import Location, StoreLocation, fetched, files_below, is_folder, location_of
-from streamfeat.recordings.bags import is_bag
+from streamfeat.recordings.bags import METADATA, is_bag
 from streamfeat.recordings.reader import Label
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["Conversion", "SamplePath", "convert", "find_samples", "is_data_set"]
 
+_ENDINGS = (*EXTENSIONS, *RECORDED)
 _LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
 _HELD_IN_MEMORY = 2 << 20  # bytes of a file, at most 96 times that in events; larger files are read twice
 
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """What became of a source: counts of what was written, and a line for each file with a fault.
+    """Result of a conversion: counts of what was written, and a line for each file with a fault.
 
     `failed` files are not in the recording; of `damaged` files, all that could be read is.
     `bytes_in` counts the files that were converted, `bytes_out` the recording; `removed` the events that were
@@ -49,7 +51,7 @@ class Conversion:
 
 @dataclass(frozen=True, slots=True)
 class _DataSet:
-    """What the documentation of a data set says and its files do not."""
+    """Facts of a data set that stand in its documentation and not in its files."""
 
     duration_us: int
     """Nominal length of a sample."""
@@ -81,7 +83,7 @@ _NOTHING = _Measured((), (1, 1), 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What became of reading one file, and its bytes."""
+    """The outcome of reading one file, and its bytes."""
 
     file: _Measured
     damage: str = ""
@@ -100,7 +102,7 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
     the label whose name ends in train, test, validation or a usual variant (`Train`, `n-cars_test`) gives the
     split; `folder` itself counts. Hidden files, folders of annotations, and files without a label are passed
-    over.
+    over. A rosbag2 folder, known by its `metadata.yaml`, is one sample.
 
     Args:
         folder: or its URL.
@@ -116,10 +118,13 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
         raise InputError(f"{folder}: is no folder")
     samples = []
     name = folder.name if isinstance(folder, StoreLocation) else folder.resolve().name
-    for path, source in _files(folder):
+    files = [*_files(folder)]
+    bags = {source.rpartition("/")[0] for _, source in files if source.rpartition("/")[2] == METADATA}
+    for path, source in _outside_bags(files, bags):
         *above, _ = parts = source.split("/")
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
-        if hidden or path.suffix.lower() not in EXTENSIONS or not above:
+        is_sample = source in bags or path.name.lower().endswith(_ENDINGS)
+        if hidden or not is_sample or not above:
             continue
         if len(above) == 1 and split_named(above[0]):
             continue  # a file right inside a split has no label
@@ -128,16 +133,29 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     if not samples:
         raise InputError(
             f"{folder}: holds no samples; expected LABEL/FILE or SPLIT/LABEL/FILE with files ending in "
-            f"{' '.join(sorted(EXTENSIONS))}"
+            f"{' '.join(sorted(_ENDINGS))}"
         )
     return sorted(samples, key=lambda sample: sample.source)
+
+
+def _outside_bags(files: Iterable[tuple[Location, str]], bags: set[str]) -> Iterator[tuple[Location, str]]:
+    """Files of no bag, and each bag's folder."""
+    for path, source in files:
+        inside, _, name = source.rpartition("/")
+        if inside not in bags:
+            yield path, source
+        elif name == METADATA:
+            here = (
+                path.parent if isinstance(path, Path) else StoreLocation(path.url.replace(f"/{name}", "", 1))
+            )
+            yield here, inside
 
 
 def _files(folder: Location) -> Iterable[tuple[Location, str]]:
     """Files in a folder, however deep, each with its path from there."""
     if isinstance(folder, StoreLocation):
         return files_below(folder)
-    # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
+    # A link that leads nowhere is a sample that cannot be read, and is reported as one.
     return (
         (path, path.relative_to(folder).as_posix())
         for path in folder.rglob("*")
@@ -213,8 +231,8 @@ def convert(
     return replace(done, bytes_out=out.stat().st_size, removed=denoiser.removed)
 
 
-def _of_place(error: InputError, path: Path, place: Location) -> str:
-    """What is wrong with a file, by the name that its user knows."""
+def _of_place(error: InputError, path: Location, place: Location) -> str:
+    """An error with the name of the file that the user gave."""
     return str(error).replace(str(path), str(place))
 
 
@@ -250,8 +268,7 @@ def _write_samples(
     for done, (sample, look) in enumerate(zip(samples, looks, strict=True), 1):
         with contextlib.ExitStack() as copies:
             if look is None:  # it is large
-                path = copies.enter_context(fetched(sample.path))
-                look = _look_at(path, sample.path, data_set)
+                look = _look_at(copies.enter_context(_local(sample.path)), sample.path, data_set)
             if look.error:
                 failed.append((sample.path, look.error))
             else:
@@ -273,12 +290,19 @@ def _write_samples(
 
 def _look(place: Location, data_set: _DataSet | None) -> "_Look | None":
     """Read a file, if it is small enough to be held."""
-    with fetched(place) as path:
-        is_large = path.exists() and path.stat().st_size > _HELD_IN_MEMORY
-        return None if is_large else _look_at(path, place, data_set)
+    with _local(place) as path:
+        with contextlib.suppress(OSError, InputError):  # what is wrong with it is found when it is read
+            if bytes_of(path) > _HELD_IN_MEMORY:
+                return None
+        return _look_at(path, place, data_set)
 
 
-def _look_at(path: Path, place: Location, data_set: _DataSet | None) -> "_Look":
+def _local(place: Location) -> contextlib.AbstractContextManager[Location]:
+    """Where a sample is read: recordings in a store are read there, of other files a copy is made."""
+    return contextlib.nullcontext(place) if is_recorded(place) else fetched(place)
+
+
+def _look_at(path: Location, place: Location, data_set: _DataSet | None) -> "_Look":
     """Read a file, which is at `path` now."""
     try:
         file, damage = _measure(path, data_set)
@@ -286,13 +310,13 @@ def _look_at(path: Path, place: Location, data_set: _DataSet | None) -> "_Look":
             raise InputError(f"{path}: lasts to {file.last_us} us, longer than an hour; damaged?")
     except InputError as error:
         return _Look(_NOTHING, error=_of_place(error, path, place))
-    return _Look(file, damage, path.stat().st_size)
+    return _Look(file, damage, bytes_of(path))
 
 
-def _measure(path: Path, data_set: _DataSet | None) -> tuple[_Measured, str]:
+def _measure(path: Location, data_set: _DataSet | None) -> tuple[_Measured, str]:
     """Read a file once, for its extent in space and time; hold its events only when it is small."""
-    file = open_events(path)
-    batches: Iterable[Events] = [*file] if path.stat().st_size <= _HELD_IN_MEMORY else file
+    file = open_sample(path)
+    batches: Iterable[Events] = file if is_recorded(path) or bytes_of(path) > _HELD_IN_MEMORY else [*file]
     resolution = data_set.resolution if data_set else None
     n, height, width, first_us, last_us = 0, 1, 1, np.iinfo(np.int64).max, 0
     for batch in batches:

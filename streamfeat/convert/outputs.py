@@ -16,7 +16,8 @@ import numpy as np
 
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, Resolution
-from streamfeat.files.atomic import replacing
+from streamfeat.files.atomic import is_replaced, unwritable
+from streamfeat.files.outputs import OutputFile
 from streamfeat.messages.codecs import EVT3_WRAP_US, encode
 from streamfeat.messages.packets import Label
 from streamfeat.recordings.writer import RecordingWriter
@@ -54,11 +55,11 @@ class Output(Protocol):
         """Write a label, before its events, where the format has labels."""
 
     def finish(self) -> None:
-        """Write what is left; nothing is written after that."""
+        """Write the rest; call it last."""
 
 
 class _OneSensor:
-    """What the formats share that hold one sensor and no labels.
+    """The common part of formats that hold one sensor and no labels.
 
     Where `needs_order` is set, events are put in order of time within `HELD_US`.
     """
@@ -303,20 +304,20 @@ def open_output(
     """
     kind = path.suffix.lower()
     if kind not in KINDS:
-        raise InputError(f"{path}: what kind of file is that? Its name must end in {', '.join(KINDS)}")
+        raise InputError(f"{path}: an unknown ending; files that can be written end in {', '.join(KINDS)}")
     if kind == ".mcap":
         with RecordingWriter(path, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
             yield McapOutput(writer)
         return
-    if path.exists() and not overwrite:
+    if not overwrite and is_replaced(path) and path.exists():
         raise InputError(f"{path}: exists already; choose another name or allow to overwrite it")
     try:
-        with replacing(path) as temporary, temporary.open("w+b") as file:
-            output = _FOREIGN[kind](path, file)
+        with OutputFile(path) as whole:
+            output = _FOREIGN[kind](path, whole.file)
             try:
                 yield output
                 output.finish()
             finally:
                 output.close()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise unwritable(path, error) from None

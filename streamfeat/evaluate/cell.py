@@ -13,6 +13,7 @@ from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.classify.folds import assign_folds
 from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
+from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
@@ -64,17 +65,18 @@ def run_cells(
             _compile(features, recordings)
             compiled = time.perf_counter()
             samples = encode_recordings(features, recordings, report, workers=workers)
-            encoded = time.perf_counter()
-            wanted = any(cell.setting.mirror for cell in cells)
-            images = (
-                encode_recordings(features, recordings, report, mirror=True, workers=workers)
-                if wanted
-                else None
-            )
-            all_encoded = time.perf_counter()
+            seconds = {PLAIN: time.perf_counter() - compiled}
+            others: dict[Variant, EncodedSamples] = {}
+            for variant in dict.fromkeys(v for cell in cells for v in cell.setting.variants):
+                started_one = time.perf_counter()
+                others[variant] = encode_recordings(
+                    features, recordings, report, variant=variant, workers=workers
+                )
+                seconds[variant] = time.perf_counter() - started_one
         for cell in cells:
             with PeakMemory() as training:
-                result = _scored(cell, data, features, samples, images, report)
+                variants = cell.setting.variants
+                result = _scored(cell, data, features, samples, [others[v] for v in variants], report)
                 if cell.fold == 0 and not cell.swept:
                     classifier = result["classifier"]
                     result |= _looked_into(
@@ -82,7 +84,7 @@ def run_cells(
                     )
             del result["classifier"]
             result["learn_s"] = round(learned - started, 3)
-            result["encode_s"] = round((all_encoded if cell.setting.mirror else encoded) - compiled, 3)
+            result["encode_s"] = round(sum(seconds[v] for v in (PLAIN, *variants)), 3)
             result["peak_mb"] = max(making.peak_mb, training.peak_mb)
             yield cell, result
 
@@ -92,13 +94,13 @@ def _scored(
     data: DataSet,
     features: FeatureMap,
     samples: EncodedSamples,
-    images: EncodedSamples | None,
+    others: Sequence[EncodedSamples],
     report: Report,
 ) -> dict[str, Any]:
     """Train and score; the classifier is part of what is found."""
     started = time.perf_counter()
     report("training", 0, 0, f"{_INNER_FOLDS}-fold cross-validation")
-    rows, labels, numbers = training_set(samples, images if cell.setting.mirror else None)
+    rows, labels, numbers = training_set(samples, others)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
     classifier: Classifier | KernelClassifier
@@ -130,7 +132,7 @@ def _looked_into(
     report: Report,
     early_samples: int,
 ) -> dict[str, Any]:
-    """What is found out about the base setting only."""
+    """Results that are made for the base setting only."""
     report("prequential", 0, 1, "")
     order = np.random.default_rng(cell.setting.seed).permutation(len(samples.labels))
     labels = samples.labels.tolist()
@@ -174,11 +176,12 @@ def _samples(recordings: Iterable[Recording]) -> Iterator[Sample]:
 
 
 def _learned(encoder: Encoder) -> dict[str, Any]:
-    """What the report draws of an encoder: some filters in the whitened domain, and how learning went."""
+    """For the report: some filters in the whitened domain, and the course of learning."""
     geometry = encoder.geometry
     shown = np.unique(np.linspace(0, encoder.n_filters - 1, _SHOWN_FILTERS).astype(int))
     return {
         "shape": [geometry.n_bins, geometry.patch, geometry.patch],
+        "n_filters": encoder.n_filters,
         "filters": [[round(float(v), 4) for v in encoder.filters[k]] for k in shown],
         **{
             name: encoder.provenance[name]

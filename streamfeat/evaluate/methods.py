@@ -5,18 +5,21 @@ Not here: methods without filters (`surfaces`), and what features are good for (
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.evaluate.plan import Trial
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.learn.fit import learn_encoder, prepare
 from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import Recording
+from streamfeat.shipped.general import GENERAL_MODEL
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["make_features"]
+__all__ = ["make_features", "model_path"]
 
 _MEANS_ITERATIONS = 20
 """As many passes over the volumes as the direct formulation takes with its start."""
@@ -25,10 +28,15 @@ Report = Callable[[str, int, int, str], None]
 """Called with (step, done, of how many, remark)."""
 
 
+def model_path(trial: Trial) -> Path:
+    """The file of the model that the method `model` takes."""
+    return Path(trial.model) if trial.model else GENERAL_MODEL
+
+
 def make_features(
     method: str,
     recordings: Sequence[Recording],
-    setting: Setting,
+    setting: Trial,
     report: Report,
     workers: Workers = THIS_PROCESS,
 ) -> FeatureMap:
@@ -45,6 +53,8 @@ def make_features(
         InputError: there is too little to learn from.
         KeyboardInterrupt: Ctrl-C, at any time.
     """
+    if method == "model":
+        return Encoder.load(model_path(setting))
     if method == "counts":
         return CountImage()
     if method == "hats":

@@ -242,7 +242,7 @@ def _filters(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]
             height=int(80 + 980 * height / width),
             x_range=(0, width),
             y_range=(height, 0),
-            title=f"{row['method']}: {len(shown)} of {row['setting']['filters']:,} filters",
+            title=f"{row['method']}: {len(shown)} of {row['learned']['n_filters']:,} filters",
         )
         # Rows of an image are drawn upwards; the axis runs downwards.
         plot.image(image=[image], x=0, y=0, dw=width, dh=height, palette=Greys256)

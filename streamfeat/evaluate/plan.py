@@ -1,13 +1,14 @@
-"""What is to be evaluated: methods, settings, and the cells of the table that follow.
+"""The plan of an evaluation: methods, settings, and the cells of the resulting table.
 
-Lives here: `Cell` and its `Trial`, what of a setting each method uses, and sweeps as they are asked for.
-Not here: what can be set (`learn.setting`), what is done in a cell (`cell`).
+Lives here: `Cell` and its `Trial`, the settings that each method uses, and sweeps as they are asked for.
+Not here: the settings of learning (`learn.settings`), the work of a cell (`cell`).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
@@ -18,6 +19,7 @@ METHODS = {
     "inverse": "learned dictionary (inverse formulation)",
     "kmeans": "spherical k-means filters",
     "random": "random filters",
+    "model": "a model that was learned before",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
     "counts": "count images",
@@ -26,20 +28,32 @@ METHODS = {
 
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
-_TRAINING = ("mirror", "kernel")
-_USED_WITHOUT_FILTERS = {"hats": _TRAINING, "hots": ("seed", *_TRAINING), "counts": _TRAINING}
+_TRAINING = ("mirror", "cuts", "shift", "kernel")
+_OTHERS_USE = {
+    "model": ("model", *_TRAINING),
+    "hats": _TRAINING,
+    "hots": ("seed", *_TRAINING),
+    "counts": _TRAINING,
+}
+"""Settings of methods that learn no filters here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial(Setting):
-    """What a run can be told: all that `learn` can, and how the classifier is trained.
+    """The settings of a run: those of `learn`, and those of training the classifier.
 
     Attributes:
+        model: path of the model that the method `model` takes; the general model that ships if empty.
         mirror: train on mirror images of the training samples as well.
+        cuts: milliseconds after which samples are cut to be trained on as well, such as `33+67`.
+        shift: pixels by which samples are moved to each side to be trained on as well.
         kernel: `linear`, or `rbf`.
     """
 
+    model: str = ""
     mirror: bool = False
+    cuts: str = ""
+    shift: int = 0
     kernel: str = "linear"
 
     def __post_init__(self) -> None:
@@ -47,26 +61,32 @@ class Trial(Setting):
         if self.kernel not in ("linear", "rbf"):
             raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
         Setting.__post_init__(self)
+        self.variants  # noqa: B018  (refuses what makes no sense)
+
+    @property
+    def variants(self) -> tuple[Variant, ...]:
+        """What the classifier is trained on beside the samples themselves."""
+        return variants_of(mirror=self.mirror, cuts=parse_cuts(self.cuts), shift=self.shift)
 
 
 _DEFAULTS = {field.name: field.default for field in fields(Trial)}
 
 SWEPT = tuple(name for name in _DEFAULTS if name != "formulation")
-"""What can be swept; the formulation is a method."""
+"""Settings that can be swept; the formulation is a method."""
 
 
 def used_by(method: str) -> tuple[str, ...]:
     """Names of the values of a setting that mean something to a method."""
-    if method in _USED_WITHOUT_FILTERS:
-        return _USED_WITHOUT_FILTERS[method]
-    return tuple(name for name in SWEPT if name not in _NOT_USED.get(method, ()))
+    if method in _OTHERS_USE:
+        return _OTHERS_USE[method]
+    return tuple(name for name in SWEPT if name not in {"model", *_NOT_USED.get(method, ())})
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One run: a method in a setting on a fold; `swept` names what differs from the base, if anything.
 
-    What the method does not use has its default in the setting, so that equal runs are equal cells.
+    Settings that the method does not use have their defaults, so that equal runs are equal cells.
     """
 
     method: str
@@ -86,7 +106,9 @@ class Cell:
 
     def has_features_of(self, other: "Cell") -> bool:
         """Whether the same features serve both, so that they need not be made twice."""
-        mine, others = (replace(cell.setting, mirror=False, kernel="linear") for cell in (self, other))
+        mine, others = (
+            replace(cell.setting, mirror=False, cuts="", shift=0, kernel="linear") for cell in (self, other)
+        )
         return (self.method, self.fold, mine) == (other.method, other.fold, others)
 
 

@@ -1,22 +1,24 @@
 """All cells, each kept as soon as it is done, and the result that they add up to.
 
 Lives here: the loop, the state file that an interrupted run goes on from, sums over folds.
-Not here: what a cell does (`cell`), the result as text or page (`tables`, `page`).
+Not here: the work of a cell (`cell`), the result as text or page (`tables`, `page`).
 """
 
 import json
 import os
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.cell import run_cells
 from streamfeat.evaluate.leakage import check_leakage
-from streamfeat.evaluate.methods import Report
+from streamfeat.evaluate.methods import Report, model_path
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
 from streamfeat.evaluate.scores import (
@@ -26,14 +28,14 @@ from streamfeat.evaluate.scores import (
     time_to_share,
 )
 from streamfeat.evaluate.splits import DataSet
-from streamfeat.files.atomic import write_atomically
-from streamfeat.files.locations import size_of
+from streamfeat.files.atomic import unwritable, write_atomically
+from streamfeat.files.outputs import locked_file
 from streamfeat.report.machine import describe_machine
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["StateFile", "evaluate", "save_result", "state_path"]
 
-_VERSION = 3
+_VERSION = 4
 
 _UNITS_IN_WORDS = {
     "block": "runs of neighbouring samples, 25 of each class",
@@ -43,7 +45,7 @@ _UNITS_IN_WORDS = {
 
 
 def state_path(output: Path) -> Path:
-    """Where the state of a run is kept whose result goes to `output`."""
+    """The state file of a run whose result goes to `output`."""
     return output.with_name(output.name + ".part")
 
 
@@ -55,7 +57,7 @@ class StateFile:
         header: what has to be the same for cells to be used again (JSON values).
 
     Raises:
-        InputError: the file is of another run, or cannot be written.
+        InputError: the file is of another run, is being written by one, or cannot be written.
     """
 
     def __init__(self, path: Path | None, header: dict[str, Any]) -> None:
@@ -64,10 +66,16 @@ class StateFile:
         self._done: dict[str, dict[str, Any]] = {}
         if path is None:
             return
-        try:
-            lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        self._begun = False
+        self._file = locked_file(path)
+        with ExitStack() as opening:
+            opening.callback(self.close)
+            self._read(path, header)
+            opening.pop_all()
+
+    def _read(self, path: Path, header: dict[str, Any]) -> None:
+        lines = self._file.read().splitlines(keepends=True)
+        self._begun = bool(lines)
         # A line without its end was being written when the run was cut off.
         whole = [line for line in lines if line.endswith(b"\n")]
         records = [_parsed(path, i, line) for i, line in enumerate(whole)]
@@ -78,8 +86,11 @@ class StateFile:
             )
         for record in records[1:]:
             self._done[_name(record["cell"])] = record["result"]
-        if not records or len(whole) < len(lines):
-            write_atomically(path, b"".join(whole) or _line(header))
+        self._file.truncate(sum(map(len, whole)))
+        self._file.seek(0, os.SEEK_END)
+        if not records:
+            self._append(header)
+            self._begun = True
 
     def __len__(self) -> int:
         """How many cells are done."""
@@ -96,15 +107,25 @@ class StateFile:
             InputError: there is no room for it.
         """
         self._done[_name(cell.key)] = result
-        if self._path is None:
-            return
+        if self._path is not None:
+            self._append({"cell": cell.key, "result": result})
+
+    def close(self) -> None:
+        """Let another run write to the file; it is removed if not even its first line could be written."""
+        if self._path is not None and not self._file.closed:
+            if not self._begun:
+                self._path.unlink(missing_ok=True)
+            with suppress(OSError):  # what there was no room for was told of
+                self._file.close()
+
+    def _append(self, record: dict[str, Any]) -> None:
+        assert self._path is not None
         try:
-            with self._path.open("ab") as file:
-                file.write(_line({"cell": cell.key, "result": result}))
-                file.flush()
-                os.fsync(file.fileno())
+            self._file.write(_line(record))
+            self._file.flush()
+            os.fsync(self._file.fileno())
         except OSError as error:
-            raise InputError(f"{self._path}: cannot be written: {error.strerror}; is there room?") from error
+            raise unwritable(self._path, error) from None
 
 
 def _name(key: dict[str, Any]) -> str:
@@ -153,32 +174,32 @@ def evaluate(
     header = {
         "format": "streamfeat-evaluate",
         "version": _VERSION,
-        "recordings": [[path.name, size_of(path)] for path in data.paths],
         "folds": data.n_folds,
         "scored": data.scored,
         "groups": data.groups,
         "early_samples": early_samples,
-    }
-    kept = StateFile(state, header)
-    leakage = check_leakage(data, report, workers)
+        "models": _models(cells),
+    } | data.identity
     rows: list[dict[str, Any]] = []
-    for i, cell in enumerate(cells):
-        report("cells", i, len(cells), cell.method + (f", {_swept(cell)}" if cell.swept else ""))
-        if kept.get(cell) is None:
-            alike: dict[str, Cell] = {}
-            for other in cells[i:]:
-                if other.has_features_of(cell) and kept.get(other) is None:
-                    alike.setdefault(_name(other.key), other)
-            for one, result in run_cells(
-                data, [*alike.values()], report, early_samples=early_samples, workers=workers
-            ):
-                kept.add(one, result)
-        if cell.fold == data.n_folds - 1:
-            rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)], data.units))
-            first = next(row for row in rows if row["method"] == cell.method) if cell.swept else rows[0]
-            if rows[-1] is not first:
-                rows[-1]["difference"] = _difference(rows[-1]["hits"], first["hits"], data.units)
-            finished(rows[-1])
+    with closing(StateFile(state, header)) as kept:
+        leakage = check_leakage(data, report, workers)
+        for i, cell in enumerate(cells):
+            report("cells", i, len(cells), cell.method + (f", {_swept(cell)}" if cell.swept else ""))
+            if kept.get(cell) is None:
+                alike: dict[str, Cell] = {}
+                for other in cells[i:]:
+                    if other.has_features_of(cell) and kept.get(other) is None:
+                        alike.setdefault(_name(other.key), other)
+                for one, result in run_cells(
+                    data, [*alike.values()], report, early_samples=early_samples, workers=workers
+                ):
+                    kept.add(one, result)
+            if cell.fold == data.n_folds - 1:
+                rows.append(_row(cell, [kept.get(c) or {} for c in _folds_of(cell, cells)], data.units))
+                first = next(row for row in rows if row["method"] == cell.method) if cell.swept else rows[0]
+                if rows[-1] is not first:
+                    rows[-1]["difference"] = _difference(rows[-1]["hits"], first["hits"], data.units)
+                finished(rows[-1])
     report("cells", len(cells), len(cells), "")
     return {
         "recordings": [path.name for path in data.paths],
@@ -191,6 +212,12 @@ def evaluate(
         "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
         "machine": describe_machine(),
     }
+
+
+def _models(cells: Sequence[Cell]) -> dict[str, str]:
+    """The models that cells take, and a digest of each: a state of other files is of another run."""
+    paths = {model_path(cell.setting) for cell in cells if cell.method == "model"}
+    return {str(path): Encoder.load(path).fingerprint for path in sorted(paths)}
 
 
 def save_result(path: Path, result: dict[str, Any]) -> None:

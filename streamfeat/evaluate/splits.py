@@ -1,21 +1,24 @@
-"""What is learned from and what is scored.
+"""The samples to learn from and those to score.
 
 Lives here: labelled recordings whose samples are held out, by their own splits or by folds.
 Not here: learning and scoring.
 """
 
 import contextlib
+import hashlib
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from streamfeat.classify.folds import assign_folds, bootstrap_units, groups_named
 from streamfeat.errors import InputError
-from streamfeat.files.locations import Location, absolute
+from streamfeat.files.locations import Location, absolute, size_of
+from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import (
     HELD_OUT_SPLITS,
     WHOLE,
@@ -43,18 +46,25 @@ class Fold(Recording):
         topic: as for `open_recording`.
         held_out: the labels that are.
         part: as for `Recording`.
+        reading: how to read it.
     """
 
     def __init__(
-        self, path: Location, topic: str | None, held_out: frozenset[Label] = frozenset(), part: Part = WHOLE
+        self,
+        path: Location,
+        topic: str | None,
+        held_out: frozenset[Label] = frozenset(),
+        part: Part = WHOLE,
+        reading: ReadOptions = AS_IT_IS,
     ) -> None:
         """Open it."""
-        self._held_out = held_out
-        super().__init__(path, topic, part)
+        self._held_out, self._reading = held_out, reading
+        self._place = absolute(path)
+        super().__init__(path, topic, part, reading)
 
     def part(self, part: Part) -> Callable[[], Recording]:
         """See `Recording`."""
-        return partial(Fold, absolute(self.path), self.topic, self._held_out, part)
+        return partial(Fold, self._place, self.topic, self._held_out, part, self._reading)
 
     def placed_items(self, part: Part) -> Iterator[tuple[int, Packet | Label]]:
         """As those of the recording, with other splits, and without a held-out label and its events."""
@@ -86,6 +96,7 @@ class DataSet:
         seed: of folds that are shuffled.
         groups: which samples are never on two sides of a fold, see `classify.folds`.
         on: `held-out`, or `train` for folds of the samples that are not held out.
+        reading: how to read the recordings.
 
     Attributes:
         labels: of all samples in stored order, of each recording.
@@ -94,6 +105,7 @@ class DataSet:
         seed: as given.
         scored: what is scored, in words.
         n_folds: 1 where that is a held-out split.
+        assumptions: what the recordings leave open, a line each.
         units: the unit of each scored sample that a bootstrap draws whole, in stored order, fold after fold.
 
     Raises:
@@ -109,17 +121,20 @@ class DataSet:
         seed: int,
         on: str = "held-out",
         groups: str = "block",
+        reading: ReadOptions = AS_IT_IS,
     ) -> None:
         """Read the labels."""
         if on not in ("held-out", "train"):
             raise InputError(f"--on {on} is unknown; choose held-out or train")
         self.groups, self.seed = groups_named(groups), seed
         self.paths = list(paths)
-        self._topic = topic
+        self._topic, self._reading = topic, reading
         self.labels: list[list[Label]] = []
+        self.assumptions: list[str] = []
         for path in self.paths:
-            with open_recording(path, topic) as recording:
+            with open_recording(path, topic, reading) as recording:
                 self.labels.append(recording.labels)
+                self.assumptions += recording.assumptions
             _check_labels(path, self.labels[-1])
         every = [label for labels in self.labels for label in labels]
         counts = Counter(label.label for label in every)
@@ -167,17 +182,37 @@ class DataSet:
         ]
         self.units = bootstrap_units(*_columns(every), self.groups)[np.concatenate(tests)]
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells this data from other data: names and sizes of files, and how they are read."""
+        known: dict[str, Any] = {"recordings": [[path.name, _size(path)] for path in self.paths]}
+        if self._reading != AS_IT_IS:
+            labels = hashlib.sha256(repr(self.labels).encode()).hexdigest()
+            known["reading"] = [repr(replace(self._reading, labels=None)), labels]
+        return known
+
     @contextlib.contextmanager
     def open(self, fold: int) -> Iterator[list[Recording]]:
         """The recordings with the splits of one fold, closed afterwards."""
         with contextlib.ExitStack() as files:
             if not self._folds:
-                yield [files.enter_context(open_recording(path, self._topic)) for path in self.paths]
+                yield [
+                    files.enter_context(open_recording(path, self._topic, self._reading))
+                    for path in self.paths
+                ]
             else:
                 yield [
-                    files.enter_context(Fold(path, self._topic, held_out))
+                    files.enter_context(Fold(path, self._topic, held_out, reading=self._reading))
                     for path, held_out in zip(self.paths, self._folds[fold], strict=True)
                 ]
+
+
+def _size(path: Location) -> int:
+    """Bytes of a file; 0 for what is none, such as a pattern."""
+    try:
+        return size_of(path)
+    except OSError:
+        return 0
 
 
 def _columns(labels: Sequence[Label]) -> tuple[list[str], list[str]]:
@@ -187,7 +222,10 @@ def _columns(labels: Sequence[Label]) -> tuple[list[str], list[str]]:
 
 def _check_labels(path: Location, labels: Sequence[Label]) -> None:
     if not labels:
-        raise InputError(f"{path}: has no labelled samples; `streamfeat convert` writes labels")
+        raise InputError(
+            f"{path}: has no labelled samples; give them with --labels FILE.csv, or write them with "
+            "`streamfeat convert`"
+        )
     missing = [i for i, label in enumerate(labels) if not label.label]
     if missing:
         raise InputError(

@@ -1,6 +1,7 @@
 """How every kernel is compiled.
 
-Lives here: the two decorators of the kernels, and the one of their vector code. Not here: the kernels.
+Lives here: the decorators of the kernels, and the one of their vector code.
+Not here: the kernels, and where machine code is kept (`cache`).
 
 Kernels are compiled without numba's reference counts. With them each call of one kernel from another counts
 every array up and down, atomically, in tuples of forty: 480 ns an event, where counting it takes 10. An
@@ -14,13 +15,28 @@ from typing import Any
 from numba import njit
 from numba.extending import intrinsic
 
-kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+from streamfeat.kernels.cache import keep
+
+
+def _kept(**options: Any) -> Any:
+    compiled = njit(nogil=True, **options)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = compiled(function)
+        keep(dispatcher)
+        return dispatcher
+
+    return decorate
+
+
+kernel = _kept(error_model="numpy", _nrt=False)
 """Compiled once for each set of argument types, kept on disk, and free of the GIL while it runs."""
 
-inlined = njit(  # type: ignore[call-overload]
-    cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True
-)
+inlined = _kept(error_model="numpy", _nrt=False, forceinline=True)
 """The same for small parts of a loop over events: a call would copy all arrays' descriptions."""
+
+allocating = _kept()
+"""The same for what makes arrays, whose references must be counted."""
 
 generated: Callable[[Callable[..., Any]], Callable[..., Any]] = intrinsic
 """A function whose machine code its body writes, in LLVM's own terms; for `vectors` alone."""

@@ -16,10 +16,9 @@ bin, because a volume that enters a plane has its response computed afresh.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.compiled import allocating, inlined, kernel
 from streamfeat.kernels.layout import LANES, Operator
 
 MAX_ROUNDS = 4000
@@ -299,7 +298,7 @@ def fix_atoms(atoms: NDArray[np.float64], operator: Operator, code: NDArray[np.i
     code[atoms.shape[0] :] = 0
 
 
-@njit(cache=True, nogil=True)
+@allocating
 def solve_lasso_rows(
     right: NDArray[np.float32],
     squares: NDArray[np.float64],

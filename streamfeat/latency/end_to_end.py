@@ -1,15 +1,15 @@
-"""End to end: from the moment events are due to the moment a sink holds what was read from them.
+"""End to end: from the time that events are due to the time that a sink holds the emission.
 
 Lives here: running the real pipeline at the pace of the recording, with a watch at both ends.
 Not here: the pipeline itself, which is not changed and not told; a single update (`update`).
 
 At recorded pace the pipeline hands on packets, cut to at most 10 ms of the clock, when their latest event
 is due by the clock. A latency is the time from there until an emission that reflects this packet is handed
-to the sink. In it: waiting in both queues, two changes of thread on either side, feeding, reading, and, under
-`event`, the 256 emissions that travel together. Not in it: what happens before a packet is complete (an event
-waits for the rest of its 10 ms), and what a sink does afterwards. When the machine cannot keep the pace,
-packets are handed on late, and since latency counts from when they were due, it grows: nothing is hidden
-by a source that waits. Silence between labelled samples is cut to one window.
+to the sink. It includes waiting in both queues, two changes of thread on either side, feeding, making the
+emission and, under `event`, the 256 emissions that travel together. It does not include the time before a
+packet is complete (an event waits for the rest of its 10 ms) and the work of a sink afterwards. When the
+machine cannot keep the pace, packets are handed on late, and latency, which counts from when they were due,
+grows: a source that waits hides nothing. Silence between labelled samples is cut to one window.
 """
 
 import asyncio

@@ -63,10 +63,10 @@ class Row:
     """One distribution.
 
     Attributes:
-        model: what was measured.
+        model: the model that was measured.
         emit: under which policy.
-        what: which part of it.
-        latencies: how long it took.
+        what: the part of the way.
+        latencies: their distribution.
         boundary_share: share of events that began a new bin, where that is known.
         walk: each event by itself, where each was timed by itself.
     """
@@ -116,7 +116,7 @@ class LatencyReport:
         look_ahead: bool = True,
         threads: int | None = None,
     ) -> None:
-        """Open and check everything; nothing is measured yet."""
+        """Open and check everything, without measuring."""
         for name, value, most in (("--seconds", seconds, _MOST_SECONDS), ("--speed", speed, 1e9)):
             if not 0 < value < most:
                 raise InputError(
@@ -174,7 +174,7 @@ class LatencyReport:
         self.steal, self.preemptions = disturbance.steal_share(), disturbance.preemptions()
 
     def result(self) -> dict[str, Any]:
-        """What was measured, as JSON values."""
+        """The measurements as JSON values."""
         return {
             "recording": str(self._recording),
             "machine": describe_machine(),
@@ -226,7 +226,7 @@ class LatencyReport:
         if job.policy == EmitPolicy("events", 1):
             steps = [self._updates, self._calls, self._end_to_end]
         else:
-            steps = [self._readings, self._end_to_end]
+            steps = [self._emissions, self._end_to_end]
         for step in steps:
             if not job.stopped():
                 yield from step(job)
@@ -247,12 +247,12 @@ class LatencyReport:
         )
         yield job.row("from Python", Latencies(found.ns))
 
-    def _readings(self, job: "_Job") -> Iterator[Row]:
+    def _emissions(self, job: "_Job") -> Iterator[Row]:
         goes = self._budget(job, "feed and read")
         found = feed_and_read(job.model.encoder, self._items, job.policy, warm_up=self._warm_up, goes=goes)
         each_event = np.round(found.batch_ns / found.batch_events).astype(np.int64)
         yield job.row("ingest", Latencies(each_event, found.batch_events))
-        yield job.row("reading", Latencies(found.reading_ns))
+        yield job.row("emission", Latencies(found.emission_ns))
 
     def _end_to_end(self, job: "_Job") -> Iterator[Row]:
         ends: list[float] = []

@@ -16,11 +16,14 @@ from streamfeat.work.workers import THIS_PROCESS, Sums, Workers
 
 __all__ = ["ChunkedVolumes", "Rows", "checked_volumes"]
 
+_KEPT = 1 << 27
+"""Bytes of floats that may be kept rather than made anew on each of a score of passes."""
+
 Make = Callable[[Any], NDArray[np.float32]]
 
 
 class Rows(Protocol):
-    """What has a shape and gives rows for a slice or for indices: arrays, memory maps."""
+    """A matrix with a shape that gives rows for a slice or for indices: an array, a memory map."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -56,9 +59,16 @@ class ChunkedVolumes:
         self._held_make = workers.hold(make)
 
     def made(self, make: Make) -> "ChunkedVolumes":
-        """The same rows, made otherwise; the workers are not handed them again."""
+        """The same rows, made otherwise; the workers are not handed them again.
+
+        They are made once where they take no more than 128 MiB, else on every pass; the bits are the same.
+        """
         other = ChunkedVolumes.__new__(ChunkedVolumes)
         other._start(self._source, make, self._workers, self._held)
+        if 4 * self.shape[0] * self.shape[1] <= _KEPT:
+            held = [(one,) for one in self._held]
+            other._held = self._workers.each(_with_floats, held, other._held_make)
+            other._held_make = self._workers.hold(None)
         return other
 
     @property
@@ -88,7 +98,7 @@ class ChunkedVolumes:
         return self._workers.each(self._on(beside), self._tuples(beside), *self._shared(step, common))
 
     def fetch(self, held: list[Any], read: Callable[[Any], Any] | None = None) -> list[Any]:
-        """What `each` holds, or `read` of it."""
+        """The values of `each`, passed through `read` if that is given."""
         return self._workers.fetch(self._workers.each(read, [(one,) for one in held]) if read else held)
 
     def _tuples(self, beside: list[Any] | None) -> list[tuple[Any, ...]]:
@@ -135,6 +145,10 @@ def _made(start: int, rows: Any, make: Make | None) -> NDArray[np.float32]:
             f"({int((~sound).sum())} such among volumes {start} to {start + len(chunk) - 1})"
         )
     return chunk
+
+
+def _with_floats(held: tuple[int, Any], make: Make) -> tuple[int, NDArray[np.float32]]:
+    return held[0], _made(*held, make)
 
 
 def _on_chunk(held: tuple[int, Any], make: Make | None, step: Callable[..., Any], *common: Any) -> Any:

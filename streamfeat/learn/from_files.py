@@ -1,7 +1,7 @@
 """Learning with one call, for programs.
 
 Lives here: `learn_encoder` as `import streamfeat` offers it, which opens recordings and sums up settings.
-Not here: the steps of learning (`fit`), what can be set (`settings`).
+Not here: the steps of learning (`fit`), the settings (`settings`).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,6 +12,7 @@ from typing import Any
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.learn import fit
+from streamfeat.learn.sensor import suited_to
 from streamfeat.learn.settings import DEFAULTS, Setting, preset_with
 from streamfeat.recordings.reader import Recording, open_recording
 
@@ -43,7 +44,8 @@ def learn_encoder(
         resume: an encoder to go on from, learned from the same recordings with the same settings.
         report: called with (step, done, of how many, remark); of how many is 0 where that is unknown.
         settings: of geometry and learning, see `streamfeat.learn.settings.Setting`: `formulation`, `filters`,
-            `patch`, `bins`, `window_ms` and so on.
+            `patch`, `bins`, `window_ms` and so on. Without `stride`, `downsample` and `preset` the grid is
+            the finest that one core follows on the sensor, emitting every 10 ms.
 
     Raises:
         InputError: a recording cannot be read, a setting is unknown or out of range, or there is not enough
@@ -61,4 +63,6 @@ def learn_encoder(
             source if isinstance(source, Recording) else files.enter_context(open_recording(source))
             for source in sources
         ]
+        if preset == "default" and not settings.keys() & {"stride", "downsample"}:
+            setting = suited_to(opened, setting)
         return fit.learn_encoder(opened, setting, resume=resume, report=report)

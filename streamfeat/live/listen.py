@@ -35,6 +35,7 @@ from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline, Processor
@@ -58,7 +59,7 @@ class ListenJob:
 
     Args:
         names: of the topics.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of one to predict with, or the classifier; features alone without it.
         emit: when to emit, see `EmitPolicy.parse`.
         learn_online: learn from labels that are published beside the events.
@@ -88,7 +89,7 @@ class ListenJob:
     def __init__(
         self,
         names: Names,
-        model: ModelSource,
+        model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
         emit: str | EmitPolicy = "auto",
@@ -203,7 +204,10 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+                n_filters = self._encoder.n_filters
+                return lines.open(
+                    self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
+                )
 
             with self.opened(sinks) as pipeline:
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
@@ -236,6 +240,7 @@ class ListenJob:
             engine=self._engine_of(topic),
             denoising=self._denoising,
             threads=self._threads,
+            load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
         )
 
     def _checkpointer(self, path: Path) -> Checkpointer:
@@ -271,7 +276,7 @@ def _recording_sink(path: Path) -> RecordingSink:
 
 def listen(
     topics: str,
-    model: ModelSource,
+    model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
     emit: str | EmitPolicy = "auto",
@@ -299,7 +304,7 @@ def listen(
     Args:
         topics: zenoh key expression, such as `robot/*/events`; or a ROS 2 topic (rmw_zenoh), with its slash
             in front.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
         emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
         ros_domain: ROS_DOMAIN_ID, of a ROS 2 topic.

@@ -10,8 +10,8 @@ from streamfeat.files.json_fields import Fields
 
 __all__ = ["CameraClock", "Placement"]
 
-_WRAPS_US = (1 << 31, 1 << 24)
-"""Periods of camera clocks that are known to wrap: libcaer (36 minutes) and EVT3 (16.8 s)."""
+_WRAPS_US = (1 << 32, 1 << 31, 1 << 24)
+"""Periods of camera clocks that are known to wrap: 32 bits (72 minutes), libcaer (36) and EVT3 (16.8 s)."""
 _NEAR_US = 2_000_000
 """A fall that misses a period by less than this is a wrap."""
 _JUMP_US = 60_000_000
@@ -77,7 +77,7 @@ class CameraClock:
         """Go on from a snapshot.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         self._last_us = values.maybe("last_us", 0, _LATEST_US)
         self._heard_ns = now_ns - values.whole("passed_ns")

@@ -290,7 +290,10 @@ def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str
     kind = words >> 12
     n = int(np.count_nonzero(kind == single))
     for code, width in vectors.items():
-        n += int(np.bitwise_count(words[kind == code] & ((1 << width) - 1)).sum(dtype=np.int64))
+        is_vector = kind == code
+        if is_vector.any():
+            bits = words[is_vector] & ((1 << width) - 1)
+            n += int(np.bitwise_count(bits).sum(dtype=np.int64))
     _check_count(n, limit, encoding)
     return np.zeros(n, EVENT_DTYPE)
 
@@ -348,7 +351,10 @@ def _libcaer_cmp_words(events: Events, offset_us: NDArray[np.int64]) -> _Words:
 
 
 def _encode_evt3(events: Events, after_us: int) -> bytes:
-    """Words TIME_HIGH, TIME_LOW and ADDR_Y where they change, and ADDR_X for every event."""
+    """Words TIME_HIGH, TIME_LOW and ADDR_Y where they change, and ADDR_X for every event.
+
+    TIME_LOW follows each TIME_HIGH, as from a sensor: faery and eventcv take it for 0 until it comes.
+    """
     _check_sorted(events, "evt3")
     t, y = events["t"], events["y"].astype(np.int64)
     if t[0] < after_us:
@@ -356,24 +362,30 @@ def _encode_evt3(events: Events, after_us: int) -> bytes:
     high, low = t >> 12, t & 0xFFF
     x = events["x"] | events["p"].astype(np.uint16) << 11
     words = np.stack([0x8000 | high & 0xFFF, 0x6000 | low, y, 0x2000 | x], axis=1).astype("<u2")
-    keep = np.stack([_changed(high, -1), _changed(low, -1), _changed(y, -1), np.ones(len(y), bool)], axis=1)
+    is_high, is_low = _changed(high, -1), _changed(low, -1)
+    keep = np.stack([is_high, is_low | is_high, _changed(y, -1), np.ones(len(y), bool)], axis=1)
     # A packet can be read on its own when it starts with both times; bridges stand in front of their event.
-    steps = np.diff(high, prepend=after_us >> 12)
+    before = np.concatenate([[after_us >> 12], high[:-1]])
     pieces, done = [], 0
-    for gap in np.flatnonzero(steps > _EVT3_MAX_STEP):
-        pieces += [words[done:gap][keep[done:gap]], _evt3_bridge(int(high[gap] - steps[gap]), int(high[gap]))]
+    for gap in np.flatnonzero((high - before > _EVT3_MAX_STEP) | (high >> 12 != before >> 12)):
+        pieces += [words[done:gap][keep[done:gap]], _evt3_bridge(int(before[gap]), int(high[gap]))]
         done = int(gap)
     pieces.append(words[done:][keep[done:]])
     return np.concatenate(pieces).tobytes()
 
 
 def _evt3_bridge(start: int, stop: int) -> _Words:
-    """TIME_HIGH words from `start` towards `stop` in steps that count every wrap."""
+    """TIME_HIGH words from `start` towards `stop` in steps that count every wrap.
+
+    Each wrap is a step from 0xFFF to 0: faery 0.7.1 takes no other for one, and OpenEB none that is far off.
+    """
     if stop - start > _EVT3_MAX_STEP * _EVT3_MAX_BRIDGE:
         raise InputError(
             f"evt3 has 24-bit time and cannot jump from {start << 12} to {stop << 12} us; "
             "subtract an offset from all times, or write mono"
         )
-    bridge: NDArray[np.int64] = np.arange(start, stop, _EVT3_MAX_STEP)
+    steps = np.arange((start // _EVT3_MAX_STEP + 1) * _EVT3_MAX_STEP, stop + 1, _EVT3_MAX_STEP)
+    wraps = steps[steps % (EVT3_WRAP_US >> 12) == 0]
+    bridge = np.unique(np.concatenate([[start], wraps - 1, steps[steps < stop]]))
     words: _Words = (0x8000 | bridge & 0xFFF).astype("<u2")
     return words

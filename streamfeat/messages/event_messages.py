@@ -35,7 +35,12 @@ _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nanosec", 
 
 
 def ros2_name(schema: str) -> str:
-    """The name of a type as ROS 2 writes it: ROS 1 leaves the `msg` in the middle out."""
+    """The name of a type as ROS 2 writes it.
+
+    ROS 1 leaves the `msg` in the middle out, and DDS writes `package::msg::dds_::Type_`.
+    """
+    if "::" in schema:
+        schema = schema.removesuffix("_").replace("::dds_::", "::").replace("::", "/")
     package, _, kind = schema.partition("/")
     return f"{package}/msg/{kind}" if kind and "/" not in kind else schema
 

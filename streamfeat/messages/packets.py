@@ -159,7 +159,7 @@ class PacketReader:
         """Go on from a snapshot.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         self._last_seq = values.maybe("last_seq", 0, 1 << 64)
         self._is_broken = values.flag("is_broken")
@@ -188,6 +188,14 @@ class PacketReader:
                 events["t"] += wraps * EVT3_WRAP_US
         self._is_broken = False
         self._before = stamp_ns, int(events["t"][-1])
+
+    def count_wraps(self, n: int) -> None:
+        """The times of evt3 have wrapped so often more than was counted, in this packet and from now on."""
+        decoder = self._decoders.get("evt3")
+        if isinstance(decoder, Evt3Decoder):
+            decoder.count_wraps(n)
+            if self._before:
+                self._before = self._before[0], self._before[1] + n * EVT3_WRAP_US
 
     def resync(self) -> None:
         """Messages are missing: what came before says nothing about what follows."""

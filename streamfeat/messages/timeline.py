@@ -13,17 +13,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
+from streamfeat.events import Events
 from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.clock import CameraClock
+from streamfeat.messages.codecs import EVT3_WRAP_US
 from streamfeat.messages.delivery import Delivery, fingerprint_of
 from streamfeat.messages.event_messages import parse_events
 from streamfeat.messages.packets import MAX_PIXELS, Label, Packet, PacketReader
+from streamfeat.messages.strays import BACK_US, STEP_US, false_wrap, stray_events, tail_apart
 
-__all__ = ["TIMELINE_COUNTS", "Timeline", "stray_events"]
+__all__ = ["TIMELINE_COUNTS", "Timeline"]
 
 TIMELINE_COUNTS = (
     "restarts",
@@ -38,13 +40,6 @@ TIMELINE_COUNTS = (
     "out of order",
 )
 """What is counted, see `Timeline.counts`."""
-
-_BACK_US = 500_000
-"""A fall of less than this is events out of order, of the same clock."""
-_STEP_US = 1_000_000
-"""Within a packet, and beyond twice the time that passed between packets, a larger step is suspicious."""
-_FEW = 8
-"""Events apart from the others are strays if they are fewer than one in so many."""
 
 
 @dataclass(slots=True)
@@ -81,7 +76,7 @@ class Timeline:
         self._events: Counter[str] = Counter()
         self._reader = PacketReader(topic)
         self._delivery = Delivery()
-        self._clock = CameraClock(0, _BACK_US)
+        self._clock = CameraClock(0, BACK_US)
         self._last_us: int | None = None
         self._log_time_ns = 0
         self._heard_ns = 0
@@ -139,7 +134,36 @@ class Timeline:
             self._lost += 1
             raise
         self.encoding = self._reader.encoding
+        if self.encoding == "evt3":
+            self._take_wrap_back(packet)
         yield from self.packet(packet)
+
+    def _take_wrap_back(self, packet: Packet) -> None:
+        """Undo a wrap that strays more than half the range of evt3 ahead have made; changes the events.
+
+        One packet may be such a stray, or one event in eight of a packet.
+        """
+        t = packet.events["t"]
+        if len(t) == 0 or self._last_us is None:
+            return
+        held, before_us = self._held, self._last_us - self._clock.offset_us
+        is_behind = held is not None and bool(held.tail or held.first_us > before_us + EVT3_WRAP_US // 2)
+        if held and held.tail:
+            before_us = held.last_us
+        if is_behind and -BACK_US <= int(t[0]) - EVT3_WRAP_US - before_us <= STEP_US:
+            at: int | None = 0
+        else:
+            is_plain = bool(held) or self._is_short(packet.events, before_us)
+            at = None if is_plain else false_wrap(t, before_us, len(t) // 8)
+        if at is not None:
+            t[at:] -= EVT3_WRAP_US
+            self._reader.count_wraps(-1)
+
+    def _is_short(self, events: Events, before_us: int) -> bool:
+        """Whether no two times of a packet of evt3, or before it, are half the range of its clock apart."""
+        time_span(events, 1 << 16, 1 << 16, self._span)
+        first, last = self._span.tolist()
+        return bool(last - min(first, before_us) <= EVT3_WRAP_US // 2)
 
     def packet(self, packet: Packet) -> Iterator[Packet | Label]:
         """Take in a packet that is decoded, and yield what is certain now."""
@@ -158,13 +182,13 @@ class Timeline:
             return
         tail = 0
         before_us = self._place_before(first)
-        if last - first > _STEP_US or (before_us is not None and first < before_us - _BACK_US <= last):
+        if last - first > STEP_US or (before_us is not None and first < before_us - BACK_US <= last):
             strays = stray_events(t, before_us)
             if strays.any():
                 self._events["stray events"] += int(np.count_nonzero(strays))
                 events = events[~strays]
                 packet, t = replace(packet, events=events), events["t"]
-            tail = _tail(t)
+            tail = tail_apart(t)
             body = t[: len(t) - tail]
             first, last = int(body.min()), int(body.max())
         yield from self._settled(first)
@@ -185,7 +209,7 @@ class Timeline:
     def _place_before(self, first_us: int) -> int | None:
         """The time that this topic has reached, if the next packet goes on from there."""
         if self._held and not self._held.tail:
-            return self._held.last_us if first_us >= self._held.first_us - _BACK_US else self._last_us
+            return self._held.last_us if first_us >= self._held.first_us - BACK_US else self._last_us
         return self._held.last_us if self._held else self._last_us
 
     def _is_suspicious(self, first_us: int, log_time_ns: int) -> bool:
@@ -193,7 +217,7 @@ class Timeline:
             return False
         step = first_us + self._clock.offset_us - self._last_us
         elapsed_us = max((log_time_ns - self._log_time_ns) // 1000, 0)
-        return step < -_BACK_US or step > _STEP_US + 2 * elapsed_us
+        return step < -BACK_US or step > STEP_US + 2 * elapsed_us
 
     def _settled(self, next_us: int | None) -> Iterator[Packet | Label]:
         """Use what is held, or drop it, as the next packet's first time shows; None if there is none."""
@@ -203,7 +227,7 @@ class Timeline:
         packet = held.packet
         if held.tail:
             tail_us = int(packet.events["t"][-held.tail])
-            if next_us is not None and next_us < tail_us - _BACK_US:
+            if next_us is not None and next_us < tail_us - BACK_US:
                 self._events["stray events"] += held.tail
                 held.packet = replace(packet, events=packet.events[: -held.tail])
             else:
@@ -219,8 +243,8 @@ class Timeline:
         if next_us is None or self._last_us is None:
             return False
         last_us = self._last_us - self._clock.offset_us
-        goes_on = next_us >= last_us - _BACK_US
-        return goes_on and (held.first_us < last_us or next_us < held.first_us - _BACK_US)
+        goes_on = next_us >= last_us - BACK_US
+        return goes_on and (held.first_us < last_us or next_us < held.first_us - BACK_US)
 
     def _use(self, held: _Held) -> Packet:
         packet = held.packet
@@ -242,57 +266,3 @@ class Timeline:
         if self._lost == 0 and place.epoch == 0:
             return packet
         return replace(packet, lost=self._taken_lost(), epoch=place.epoch)
-
-
-def stray_events(t: NDArray[np.int64], before_us: int | None) -> NDArray[np.bool_]:
-    """Mark the few events of one packet whose times are more than a second apart from the others.
-
-    Args:
-        t: `(n,)` times in stored order, microseconds, n > 0.
-        before_us: the time that the packets before reached, None if there are none.
-
-    Returns:
-        `(n,)`; none is marked where too many would be, for then the clock itself has moved.
-    """
-    strays = np.zeros(len(t), np.bool_)
-    if len(t) < 2:
-        return strays
-    for _ in range(3):
-        kept = np.flatnonzero(~strays)
-        ahead, behind = _apart(t[kept], before_us)
-        fewer = _less_likely(t[kept], ahead, behind)
-        if not fewer.any() or (np.count_nonzero(strays) + np.count_nonzero(fewer)) * _FEW > len(t):
-            break
-        strays[kept[fewer]] = True
-    return strays
-
-
-def _less_likely(
-    t: NDArray[np.int64], ahead: NDArray[np.bool_], behind: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """The set of fewer events; of two equal ones, that which lies further from the middle."""
-    if not (ahead.any() and behind.any()):
-        return ahead | behind
-    counts = np.count_nonzero(ahead), np.count_nonzero(behind)
-    if counts[0] != counts[1]:
-        return ahead if counts[0] < counts[1] else behind
-    far = np.abs(t - np.median(t))
-    return ahead if far[ahead].max() >= far[behind].max() else behind
-
-
-def _apart(t: NDArray[np.int64], before_us: int | None) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Events more than a step ahead of one that follows, and more than a step behind one before."""
-    lowest_after = np.minimum.accumulate(t[::-1])[::-1]
-    highest_before = np.maximum.accumulate(t)
-    if before_us is not None and np.median(t) >= before_us - _BACK_US:
-        highest_before = np.maximum(highest_before, before_us + _STEP_US - _BACK_US)
-    return t > lowest_after + _STEP_US, t < highest_before - _STEP_US
-
-
-def _tail(t: NDArray[np.int64]) -> int:
-    """How many events at the end of a packet are a step ahead of all others, and few; 0 if there are none."""
-    steps = np.flatnonzero(np.diff(t) > _STEP_US)
-    if len(steps) == 0:
-        return 0
-    tail = len(t) - 1 - int(steps[-1])
-    return tail if tail * _FEW <= len(t) else 0

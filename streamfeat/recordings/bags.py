@@ -1,4 +1,4 @@
-"""Several files as one recording: rosbag2 folders, and files that somebody lists.
+"""Several files as one recording: rosbag2 folders, and lists of files.
 
 Lives here: which files of a folder belong to the bag, what its `metadata.yaml` promises, and reading all of
 them in the order of log time, each opened when its time comes.
@@ -18,20 +18,22 @@ from streamfeat.files.locations import Location, StoreLocation, files_below, nat
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.sources import WHOLE, Part, Source, SourceItem, StoredMessage, Topic
 
-__all__ = ["BAG_ENDINGS", "FilesSource", "Metadata", "bag_members", "is_bag", "read_metadata"]
+__all__ = ["BAG_ENDINGS", "METADATA", "FilesSource", "Metadata", "bag_members", "is_bag", "read_metadata"]
 
 BAG_ENDINGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """Files of a rosbag2 folder."""
 
 MOST_FILES = 512
-_METADATA = "metadata.yaml"
+METADATA = "metadata.yaml"
+"""What rosbag2 puts beside the files of a bag."""
+
 _METADATA_BYTES = 1 << 24
 _SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What a `metadata.yaml` says of its bag.
+    """The contents of a bag according to its `metadata.yaml`.
 
     Attributes:
         names: of files, without folders.
@@ -61,11 +63,11 @@ def read_metadata(text: str) -> Metadata:
 
 def is_bag(folder: Location) -> bool:
     """Whether a folder holds a bag: its `metadata.yaml`, or a file that one can have."""
-    return any(f.name == _METADATA or f.name.endswith(BAG_ENDINGS) for f in _files_in(folder))
+    return any(f.name == METADATA or f.name.endswith(BAG_ENDINGS) for f in _files_in(folder))
 
 
 def bag_members(folder: Location) -> tuple[list[Location], Metadata, list[str]]:
-    """The files of a bag in a folder, what is promised of them, and what is to be said about that.
+    """The files of a bag in a folder, its metadata, and a line for each assumption that was made.
 
     The files are those that `metadata.yaml` names, as far as they are there; all that a bag can have if none
     of them is there. A file beside its own compressed copy stands for both.
@@ -81,23 +83,23 @@ def bag_members(folder: Location) -> tuple[list[Location], Metadata, list[str]]:
         and (not name.endswith(".zstd") or name.removesuffix(".zstd") not in there)
     }
     metadata, said = Metadata(), []
-    if _METADATA in there:
-        with open_binary(there[_METADATA]) as file:
+    if METADATA in there:
+        with open_binary(there[METADATA]) as file:
             metadata = read_metadata(file.read(_METADATA_BYTES).decode("utf-8", "replace"))
     # A bag that was unpacked, or packed, keeps the names that it had before.
     named = {n for name in metadata.names for n in (name, name.removesuffix(".zstd"), f"{name}.zstd")}
     missing = [n for n in metadata.names if not {n, n.removesuffix(".zstd"), f"{n}.zstd"} & set(files)]
     chosen = {name: place for name, place in files.items() if name in named} or files
     if not chosen:
-        wanted = f"; {_METADATA} names {_some(missing)}" if missing else ""
+        wanted = f"; {METADATA} names {_some(missing)}" if missing else ""
         raise InputError(
             f"{folder}: is a folder without a bag: no file in it ends in {', '.join(BAG_ENDINGS)}{wanted}. "
             "`streamfeat convert` makes a recording of a data set folder"
         )
     if missing:
-        said.append(f"{_METADATA} names {_some(missing)}, which the folder does not hold")
+        said.append(f"{METADATA} names {_some(missing)}, which the folder does not hold")
     if left_out := sorted(set(files) - set(chosen)):
-        said.append(f"{_some(left_out)} left out: {_METADATA} does not name them")
+        said.append(f"{_some(left_out)} left out: {METADATA} does not name them")
     return [chosen[name] for name in sorted(chosen, key=natural_order)], metadata, said
 
 
@@ -167,7 +169,7 @@ class FilesSource:
             yield 0, item
         missing = self._metadata.counts.get(topic, 0) - seen - sum(losses.counts.values())
         if missing > 0:
-            where = f"topic {topic!r}: {missing} that {_METADATA} counts are not in the files"
+            where = f"topic {topic!r}: {missing} that {METADATA} counts are not in the files"
             losses.add("missing message", 0, where, missing)
 
     def _merged(self, topic: str, losses: Losses) -> Iterator[SourceItem]:
@@ -179,7 +181,8 @@ class FilesSource:
         while waiting or heap:
             while waiting and (not heap or waiting[0][0] <= heap[0][0]):
                 start, i = waiting.pop(0)
-                _push(heap, start, i, self._sources[i].read(topic, WHOLE, losses))
+                source = self._sources[i]
+                _push(heap, start, i, source.read(topic, WHOLE, losses.of(source.path.name)))
             if heap:
                 time, i, item, rest = heapq.heappop(heap)
                 yield item
@@ -195,7 +198,7 @@ class FilesSource:
 
 
 def assumptions_of(source: Source) -> list[str]:
-    """What a source had to assume, if it is of a kind that has to."""
+    """Assumptions that a source had to make; only some kinds do."""
     return list(getattr(source, "assumptions", ()))
 
 

@@ -4,7 +4,7 @@ Lives here: its events as packets, what had to be assumed, and what could not be
 Not here: the formats (`streamfeat.camera_files`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
 import numpy as np
@@ -14,7 +14,8 @@ from streamfeat.camera_files.source import TableOptions
 from streamfeat.errors import InputError
 from streamfeat.events import Events
 from streamfeat.files.locations import Location, fetched
-from streamfeat.messages.packets import MAX_PIXELS, Packet
+from streamfeat.messages.cdr import LabelMessage
+from streamfeat.messages.packets import MAX_PIXELS, Label, Packet
 from streamfeat.recordings.options import ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.sources import Part, Topic
@@ -22,6 +23,7 @@ from streamfeat.recordings.sources import Part, Topic
 __all__ = ["CameraSource"]
 
 _TOPIC = "/events"
+_LABEL_NAMES = ("label", "labels", "class", "target", "y", "gesture", "category")
 _PACKET_EVENTS = 8192
 _PACKET_US = 1_000_000
 
@@ -64,11 +66,16 @@ class CameraSource:
         streams = self._file.streams
         self._topic = stream or (streams[0] if len(streams) == 1 else _TOPIC)
         self.topics = [Topic(self._topic, self._file.format, "", 0, is_events=True)]
+        self._label = _label_in(self._file.labels)
+        if self._label:
+            self.topics.append(Topic("/label", LabelMessage.SCHEMA_NAME, "", 1))
 
-    def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, Packet]]:
-        """See `Source`; the byte of every packet is 0."""
+    def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, Packet | Label]]:
+        """See `Source`; the byte of every item is 0."""
         seq = 0
         try:
+            if self._label:
+                yield from self._labelled()
             for block in self._file.blocks():
                 for events in _cut(block):
                     log_time_ns = int(events["t"][0]) * 1000
@@ -81,6 +88,13 @@ class CameraSource:
         for line in self._file.damage:
             losses.add("damaged file", self._file.lost_bytes, self._named(f"{self._local}: {line}"))
 
+    def _labelled(self) -> Iterator[tuple[int, Label]]:
+        """The label of a file that is one sample, from its earliest to its latest event."""
+        spans = [(block["t"].min(), block["t"].max()) for block in self._file.blocks() if len(block)]
+        if spans:
+            first, last = int(min(low for low, _ in spans)), int(max(high for _, high in spans))
+            yield 0, Label(first, last - first + 1, self._label, source=self.path.name)
+
     def cuts(self) -> list[int]:
         """See `Source`."""
         return []
@@ -92,6 +106,13 @@ class CameraSource:
     def _named(self, text: str) -> str:
         """A message with the name of the file that its user knows."""
         return text.replace(str(self._local), str(self.path))
+
+
+def _label_in(labels: Sequence[str]) -> str:
+    """The label among those that a file holds (`name = value`): the one so called, or the only one."""
+    found = dict(label.split(" = ", 1) for label in labels if " = " in label)
+    named = [value for name, value in found.items() if name.lower() in _LABEL_NAMES]
+    return named[0] if named else next(iter(found.values())) if len(found) == 1 else ""
 
 
 def _cut(block: Events) -> Iterator[Events]:

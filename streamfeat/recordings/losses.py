@@ -1,4 +1,4 @@
-"""What a pass over a recording could not read.
+"""Losses of a pass over a recording.
 
 Lives here: `Losses`. Not here: finding damage (`records`), and what was read but not used (`timeline`).
 """
@@ -13,20 +13,26 @@ __all__ = ["Losses"]
 
 @dataclass(slots=True)
 class Losses:
-    """What one pass over a recording could not read, by named reason."""
+    """Losses of one pass over a recording, by named reason."""
 
     counts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
     first: dict[str, str] = field(default_factory=dict)
     """For each reason, where it struck first and why."""
     removed: Counter[str] = field(default_factory=Counter)  # as noise, on request: no losses
+    file: str = ""
+    """Which of several files this is about; named where something struck first."""
 
     def add(self, reason: str, n_bytes: int, where: str, count: int = 1) -> None:
         """Count one loss."""
         self.counts[reason] += count
         self.bytes[reason] += n_bytes
         if reason not in self.first:
-            self.first[reason] = printable(where)
+            self.first[reason] = printable(f"{self.file}, {where}" if self.file else where)
+
+    def of(self, file: str) -> "Losses":
+        """The same counts, for what one of several files lost."""
+        return Losses(self.counts, self.bytes, self.first, self.removed, file)
 
     def add_all(self, others: "Losses") -> None:
         """Count the losses of another part of the same recording."""

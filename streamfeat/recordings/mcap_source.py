@@ -14,6 +14,7 @@ from mcap.records import Channel, Schema
 from streamfeat.files.locations import Location
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.event_messages import EVENT_SCHEMAS, ros2_name
+from streamfeat.messages.text_messages import TEXT_SCHEMAS
 from streamfeat.recordings.order import are_in_order, clean_cuts, in_log_order
 from streamfeat.recordings.records import (
     Block,
@@ -30,6 +31,7 @@ from streamfeat.recordings.sources import WHOLE, Part, StoredMessage, Topic
 __all__ = ["McapSource"]
 
 _BLOCK_BYTES = 1 << 16
+_READ = frozenset((*EVENT_SCHEMAS, *TEXT_SCHEMAS))
 
 
 class McapSource:
@@ -86,7 +88,7 @@ class McapSource:
                 self._file, self._known, losses, start, part.end, stop
             ):
                 kind = ros2_name(schema.name)
-                if kind == LabelMessage.SCHEMA_NAME or (channel.topic == topic and kind in EVENT_SCHEMAS):
+                if kind == LabelMessage.SCHEMA_NAME or (channel.topic == topic and kind in _READ):
                     seen[channel.id] += 1
                     layout = "ros1" if channel.message_encoding == "ros1" else "cdr"
                     stored = message.log_time, message.sequence, seen[channel.id]

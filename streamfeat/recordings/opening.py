@@ -4,14 +4,19 @@ Lives here: telling formats apart, by what a file begins with and then by its na
 Not here: reading them (`mcap_source` and its neighbours).
 """
 
+import bz2
 import glob
+import gzip
 import os
+import re
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from os import PathLike
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import zstandard
 
@@ -33,7 +38,15 @@ RecordingPath = str | PathLike[str] | StoreLocation | Sequence[str | PathLike[st
 
 _HEAD_BYTES = 16
 _MCAP, _ROS1, _SQLITE = b"\x89MCAP", b"#ROSBAG V", b"SQLite format 3\0"
-_ZSTD = b"\x28\xb5\x2f\xfd"
+_UNPACKERS: dict[bytes, Callable[[BinaryIO], Any]] = {
+    b"\x28\xb5\x2f\xfd": lambda packed: zstandard.ZstdDecompressor().stream_reader(
+        packed, read_across_frames=True
+    ),
+    b"\x1f\x8b": lambda packed: gzip.GzipFile(fileobj=packed),
+    b"BZh": bz2.BZ2File,
+}
+"""How a file is unpacked that was compressed as a whole, by what it begins with."""
+_PACKED_ENDING = re.compile(r"\.(?:zstd|zst|gz|bz2)$")
 _MOST_UNPACKED = 1000
 """A compressed file may unpack to so many times its bytes, and a mebibyte; bags take 2 to 20."""
 _BLOCK_BYTES = 1 << 20
@@ -88,8 +101,8 @@ def _open_file(place: Location, topic: str | None, options: ReadOptions) -> Sour
     with open_binary(place) as file:
         head = file.read(_HEAD_BYTES)
     ending = place.suffix.lower()
-    if head.startswith(_ZSTD):
-        return _unpacked(place, topic, options)
+    if head.startswith(tuple(_UNPACKERS)):
+        return _unpacked(place, head, topic, options)
     if head.startswith(_ROS1) or ending == ".bag":
         return _local(place, Ros1Source)
     if head.startswith(_SQLITE) or ending == ".db3":
@@ -103,13 +116,19 @@ def _open_file(place: Location, topic: str | None, options: ReadOptions) -> Sour
 class _OfCopy:
     """A source that reads a copy, which goes away with it."""
 
-    def __init__(self, path: Location, source: Source, copies: ExitStack) -> None:
+    def __init__(self, path: Location, copy: Path, source: Source, copies: ExitStack, damage: str) -> None:
+        # A recording notices by itself that it is cut short; a table of events may end anywhere.
+        self._damage = damage if isinstance(source, CameraSource) else ""
         self.path, self.topics = path, source.topics
-        self.assumptions = assumptions_of(source)
-        self._source, self._copies = source, copies
+        self.assumptions = [line.replace(str(copy), str(path)) for line in assumptions_of(source)]
+        self._source, self._copy, self._copies = source, copy, copies
 
     def read(self, topic: str, part: Part, losses: Losses) -> Iterator[tuple[int, SourceItem]]:
-        return self._source.read(topic, part, losses)
+        if self._damage:
+            losses.add("damaged file", 0, self._damage)
+        yield from self._source.read(topic, part, losses)
+        for reason, line in losses.first.items():
+            losses.first[reason] = line.replace(str(self._copy), str(self.path))
 
     def cuts(self) -> list[int]:
         return self._source.cuts()
@@ -124,29 +143,45 @@ def _local(place: Location, open_local: Callable[[Path], Source]) -> Source:
     if isinstance(place, Path):
         return open_local(place)
     with ExitStack() as copies:
-        source = open_local(copies.enter_context(fetched(place)))
-        return _OfCopy(place, source, copies.pop_all())
+        return _of_copy(place, copies.enter_context(fetched(place)), open_local, copies)
 
 
-def _unpacked(place: Location, topic: str | None, options: ReadOptions) -> Source:
-    """A file that was compressed as a whole (rosbag2's `compression_mode: file`), unpacked for the while."""
+def _of_copy(
+    place: Location, copy: Path, open_copy: Callable[[Path], Source], copies: ExitStack, damage: str = ""
+) -> Source:
+    try:
+        source = open_copy(copy)
+    except InputError as error:
+        raise InputError(str(error).replace(str(copy), str(place))) from None
+    return _OfCopy(place, copy, source, copies.pop_all(), damage)
+
+
+def _unpacked(place: Location, head: bytes, topic: str | None, options: ReadOptions) -> Source:
+    """A file that was compressed as a whole (rosbag2's `compression_mode: file`, `.csv.gz`), unpacked for the
+    while.
+    """
+    opened = next(opened for magic, opened in _UNPACKERS.items() if head.startswith(magic))
+    damage = ""
     with ExitStack() as copies:
         folder = copies.enter_context(tempfile.TemporaryDirectory(prefix="streamfeat-"))
-        path = Path(folder, place.name.removesuffix(".zstd").removesuffix(".zst"))
-        try:
-            with open_binary(place) as packed, path.open("wb") as copy:
-                limit = packed.seek(0, os.SEEK_END) * _MOST_UNPACKED + _BLOCK_BYTES
-                packed.seek(0)
-                with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
-                    while block := stream.read(_BLOCK_BYTES):
+        path = Path(folder, _PACKED_ENDING.sub("", place.name))
+        with open_binary(place) as packed, path.open("wb") as copy:
+            limit = packed.seek(0, os.SEEK_END) * _MOST_UNPACKED + _BLOCK_BYTES
+            packed.seek(0)
+            try:
+                with opened(packed) as stream:
+                    while block := stream.read1(_BLOCK_BYTES):
                         copy.write(block)
                         if copy.tell() > limit:
                             raise InputError(f"{place}: unpacks to over {_MOST_UNPACKED} times its bytes")
-        except zstandard.ZstdError as error:
-            if not path.stat().st_size:
-                raise InputError(f"{place}: cannot be unpacked: {error}; copy the file again") from None
-            # What came before the damage is read, and counted as cut short.
-        except OSError as error:
-            raise InputError(f"{place}: cannot be unpacked: {error.strerror}; is there room?") from None
-        source = _open_file(path, topic, options)
-        return _OfCopy(place, source, copies.pop_all())
+            except (zstandard.ZstdError, zlib.error, gzip.BadGzipFile, EOFError) as error:
+                # What came before the damage is read, and counted as cut short.
+                damage = f"{place}: cannot be unpacked after its byte {packed.tell()}: {error}"
+            except OSError as error:
+                raise InputError(
+                    f"{place}: cannot be unpacked: {error.strerror or error}; is there room?"
+                ) from None
+        if not path.stat().st_size:
+            raise InputError(f"{place}: nothing in it can be unpacked; copy the file again")
+        opener = partial(_open_file, topic=topic, options=options)
+        return _of_copy(place, path, opener, copies, damage)

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -24,12 +23,21 @@ from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import Label, Packet
 from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.bags import assumptions_of
-from streamfeat.recordings.labels import read_labels, with_labels
+from streamfeat.recordings.label_topic import labels_for
+from streamfeat.recordings.labels import with_labels
 from streamfeat.recordings.opening import RecordingPath, open_source
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.samples import Sample, complete_samples
-from streamfeat.recordings.sources import WHOLE, Part, SourceItem, StoredMessage, Topic, unpacked_message
+from streamfeat.recordings.sources import (
+    WHOLE,
+    Part,
+    SourceItem,
+    StoredMessage,
+    Topic,
+    labels_in,
+    unpacked_message,
+)
 from streamfeat.recordings.totals import Totals
 from streamfeat.report.shown import Shown
 
@@ -99,15 +107,15 @@ class Recording(Shown):
         options: ReadOptions = AS_IT_IS,
     ) -> None:
         """See `open_recording`."""
-        labels = read_labels(Path(options.labels)) if options.labels is not None else None
         self._source = open_source(path, topic, options)
-        self._given, self._part, self._options, self._labels = path, part, options, labels
+        self._given, self._part, self._options = path, part, options
         self.assumptions = assumptions_of(self._source)
-        if labels and labels.assumption:
-            self.assumptions.append(labels.assumption)
         try:
             self.path, self.topics = self._source.path, self._source.topics
             self.topic = _choose_topic(self.path, self.topics, topic)
+            self._labels = labels_for(self._source, options.labels, self.topic)
+            if self._labels and self._labels.assumption:
+                self.assumptions.append(self._labels.assumption)
             self.encoding = ""
             self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution
@@ -163,7 +171,7 @@ class Recording(Shown):
         return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
-        """What opens some of this recording, wherever that is called, and can be pickled."""
+        """A function that opens a part of this recording; it can be pickled and called on any machine."""
         return partial(Recording, _wherever(self._given), self.topic, part, self._options)
 
     def items(self) -> Iterator[Packet | Label]:
@@ -241,7 +249,7 @@ class Recording(Shown):
 
     @property
     def counts(self) -> Counter[str]:
-        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        """Counts of packets and of their times in the latest pass, see `Timeline.counts`."""
         return self._timeline.counts
 
     def played(
@@ -295,13 +303,20 @@ class Recording(Shown):
             if isinstance(item, Label):
                 totals.labels.append(item)
             else:
-                totals.add(item.events)
+                totals.add(item)
         return totals
 
     @property
     def labels(self) -> list[Label]:
         """All labels in stored order; the first use reads the whole file, as for the counts below."""
         return self._totals.labels
+
+    def stored_labels(self) -> Iterator[Label]:
+        """Yield the labels of this part, without its events; those that cannot be read are left out."""
+        if self._labels is not None:
+            yield from self.labels  # they are put into the stream by its times
+        elif self.is_labelled:
+            yield from labels_in(self._source, self.topic, self._part)
 
     @property
     def n_on(self) -> int:
@@ -338,8 +353,8 @@ class Recording(Shown):
 
     @property
     def duration_us(self) -> int:
-        """Time from the earliest to the latest event."""
-        return (self.last_us or 0) - (self.first_us or 0)
+        """Time from the earliest to the latest event; of each run of the camera's clock, in sum."""
+        return self._totals.duration_us
 
     def _first_packet(self) -> Packet:
         for _, item in self._stored_items(WHOLE):
@@ -359,7 +374,7 @@ def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
-    """The same files, whatever folder somebody works in."""
+    """The same files, whatever the working directory."""
     if isinstance(path, str) or not isinstance(path, Sequence):
         return absolute(location_of(path))
     return [absolute(location_of(one)) for one in path]

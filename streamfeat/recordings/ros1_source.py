@@ -73,7 +73,7 @@ class Ros1Source:
                 cdr = bytes(self._types.ros1_to_cdr(data, connection.msgtype))
                 yield 0, StoredMessage(name, connection.msgtype, "cdr", cdr, log_time_ns, 0, seen[name])
         except Exception as error:  # as above
-            where = f"{self.path}: after message {sum(seen.values())}: {error or type(error).__name__}"
+            where = f"after message {sum(seen.values())}: {error or type(error).__name__}"
             losses.add("damaged bag", 0, where)
         missing = promised - sum(seen.values())
         if missing > 0:

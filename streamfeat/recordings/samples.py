@@ -32,10 +32,12 @@ class _Pending:
 
     label: Label
     is_wanted: bool
+    epoch: int | None = None
     parts: list[Events] = field(default_factory=list)
     resolution: Resolution | None = None
 
     def add(self, packet: Packet) -> None:
+        self.epoch = packet.epoch
         t = packet.events["t"]
         inside = packet.events[(t >= self.label.start_us) & (t < self.end_us)]
         if len(inside):
@@ -57,8 +59,9 @@ def complete_samples(
 ) -> Iterator[Sample]:
     """Yield the samples of a stream in stored order, with memory bounded by those open at a time.
 
-    A sample is complete when a packet starts, or a label begins, at or after its end; or when 16 more have
-    begun before its end.
+    A sample is complete when a packet starts, or a label begins, at or after its end; when the camera's clock
+    starts anew; or when 16 more have begun before its end. A label right before the first packet of a new
+    clock is of that clock.
 
     Args:
         items: packets and labels, each with its byte; a label comes before its first packet.
@@ -69,6 +72,9 @@ def complete_samples(
     for at, item in items:
         if at >= end and not any(sample.is_wanted for sample in pending):
             return
+        if isinstance(item, Packet):
+            while pending and pending[0].epoch not in (None, item.epoch):
+                yield from pending.pop(0).finish(default)
         now = item.start_us if isinstance(item, Label) else _start_us(item)
         while now is not None and pending and now >= pending[0].end_us:
             yield from pending.pop(0).finish(default)

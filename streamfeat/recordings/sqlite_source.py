@@ -89,7 +89,7 @@ class SqliteSource:
                 )
         except (sqlite3.Error, OverflowError) as error:
             n = sum(seen.values())
-            losses.add("damaged database", 0, f"{self.path}: after message {n}: {error}")
+            losses.add("damaged database", 0, f"after message {n}: {error}")
         for name in wanted:
             missing = sum(t.n_messages for t in self.topics if t.name == name) - seen[name]
             if missing > 0:

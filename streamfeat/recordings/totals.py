@@ -1,4 +1,4 @@
-"""What only a full pass over a recording can tell.
+"""Totals that take a full pass over a recording.
 
 Lives here: `Totals`: labels, counts, the span of time, and the digest by which two people compare events.
 Not here: the pass itself (`reader`).
@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from streamfeat.events import Events
-from streamfeat.messages.packets import Label
+from streamfeat.messages.packets import Label, Packet
 
 __all__ = ["Totals"]
 
@@ -19,7 +18,7 @@ _DIGESTED = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "u1"), ("t", "<i8")])
 
 @dataclass(slots=True)
 class Totals:
-    """What only a full pass can tell."""
+    """Totals of a full pass."""
 
     labels: list[Label] = field(default_factory=list)
     n_on: int = 0
@@ -27,9 +26,18 @@ class Totals:
     first_us: int | None = None
     last_us: int | None = None
     hash: "hashlib._Hash" = field(default_factory=hashlib.sha256)
+    _epoch: int = 0
+    _span: tuple[int, int] | None = None
+    _before_us: int = 0
 
-    def add(self, events: Events) -> None:
-        """Count a batch: `(n,)` of `EVENT_DTYPE`, not changed."""
+    @property
+    def duration_us(self) -> int:
+        """Time from the earliest to the latest event, of each run of the camera's clock, in sum."""
+        return self._before_us + (self._span[1] - self._span[0] if self._span else 0)
+
+    def add(self, packet: Packet) -> None:
+        """Count a packet; its events are not changed."""
+        events = packet.events
         if len(events) == 0:
             return
         plain = np.empty(len(events), _DIGESTED)
@@ -40,5 +48,8 @@ class Totals:
         self.n_on += on
         self.n_off += len(events) - on
         first, last = int(events["t"].min()), int(events["t"].max())
+        if packet.epoch != self._epoch:
+            self._before_us, self._span, self._epoch = self.duration_us, None, packet.epoch
+        self._span = (min(first, self._span[0]), max(last, self._span[1])) if self._span else (first, last)
         self.first_us = first if self.first_us is None else min(first, self.first_us)
         self.last_us = last if self.last_us is None else max(last, self.last_us)

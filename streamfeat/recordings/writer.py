@@ -7,7 +7,6 @@ Not here: reading (`streamfeat.recordings.reader`), what bytes a message has (`s
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -20,7 +19,9 @@ from numpy.typing import ArrayLike
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, as_events
+from streamfeat.files.atomic import is_replaced, refuse_input, unwritable
 from streamfeat.files.locations import StoreLocation, location_of
+from streamfeat.files.outputs import OutputFile
 from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.messages.packets import Label, PacketWriter
 from streamfeat.recordings.records import Losses, count_missing, iter_messages, open_mcap, read_summary
@@ -62,6 +63,7 @@ def recover(
             `target` exists or cannot be written. `target` is then as it was before.
     """
     losses, copied = Losses(), Counter[int]()
+    refuse_input(Path(target), [source])
     # The source may well be `<target>.part`, so the copy needs a temporary name of its own.
     writer = RecordingWriter(target, overwrite=overwrite, part_suffix=".recovered")
     with writer, open_mcap(location_of(source)) as file:
@@ -82,8 +84,8 @@ def recover(
 class RecordingWriter:
     """Write one recording; a context manager.
 
-    Everything goes to `<path>.part` first, so that `path` is a whole recording or not there. Leaving the
-    block renames it to `path`; leaving it with an exception removes it, or leaves it for
+    Everything goes to `<path>.part` first (see `OutputFile`), so that `path` is a whole recording or not
+    there. Leaving the block renames it to `path`; leaving it with an exception removes it, or leaves it for
     `streamfeat recover` when `keep_partial` is set. An existing file at `path` is untouched until then.
     """
 
@@ -120,23 +122,14 @@ class RecordingWriter:
         if compression not in _COMPRESSION:
             raise InputError(f"unknown compression {compression!r}; known are {', '.join(_COMPRESSION)}")
         self.path = Path(path)
-        self._part = self.path.with_name(self.path.name + part_suffix)
         self._overwrite, self._keep_partial = overwrite, keep_partial
         self._event_topic, self._frame_id = event_topic, frame_id
         self._packets = PacketWriter(encoding, frame_id)
         self._channels: dict[str | int, int] = {}
         self._schemas: dict[int, int] = {}
         self._check_target()
-        try:
-            self._file = self._part.open("xb")
-        except FileExistsError:
-            raise InputError(
-                f"{self._part}: left by a writer that did not finish, or is still at work; save it with "
-                f"`streamfeat recover`, or delete it"
-            ) from None
-        except OSError as error:
-            raise self._unwritable(error) from None
-        self._writer = Writer(self._file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
+        self._output = OutputFile(self.path, suffix=part_suffix, keep_leftover=True)
+        self._writer = Writer(self._output.file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
         self._writer.start(profile="ros2", library="streamfeat")
 
     def __enter__(self) -> Self:
@@ -158,16 +151,15 @@ class RecordingWriter:
         Raises:
             InputError: meanwhile a file appeared at `path` and `overwrite` is not set.
         """
-        if self._file.closed:
+        if self._output.file.closed:
             return
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
             self._check_target()
-            self._part.replace(self.path)
+            self._output.close()
         except OSError as error:
             self._abandon()
-            raise self._unwritable(error) from None
+            raise unwritable(self.path, error) from None
         except BaseException:
             self._abandon()
             raise
@@ -181,7 +173,7 @@ class RecordingWriter:
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise unwritable(self.path, error) from None
 
     def write_events(self, events: Events, resolution: Resolution) -> None:
         """Write a batch as one or more packets, each at the time of its first event.
@@ -297,18 +289,11 @@ class RecordingWriter:
         try:
             self._writer.add_message(channel_id, log_time, data, publish_time, sequence)
         except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> InputError:
-        return InputError(f"{self._part}: cannot be written: {error.strerror}; is there room and permission?")
+            raise unwritable(self.path, error) from None
 
     def _check_target(self) -> None:
-        if self.path.exists() and not self._overwrite:
+        if not self._overwrite and is_replaced(self.path) and self.path.exists():
             raise InputError(f"{self.path}: exists already; choose another name or allow to overwrite it")
 
     def _abandon(self) -> None:
-        # What is still buffered may be what there is no room for.
-        with suppress(OSError):
-            self._file.close()
-        if not self._keep_partial:
-            self._part.unlink(missing_ok=True)
+        self._output.abandon(keep=self._keep_partial)

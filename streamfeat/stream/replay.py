@@ -20,6 +20,7 @@ from streamfeat.recordings.reader import Label, Packet, Recording, open_recordin
 from streamfeat.recordings.records import Losses
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.emission_stream import EmissionStream
+from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline
@@ -39,7 +40,7 @@ class ReplayJob:
 
     Args:
         recording: path or URL; or an open recording, which is not closed here.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of one to predict with, or the classifier; without it there are features alone, and
             `learn_online` starts from nothing.
         emit: when to emit, see `EmitPolicy.parse`.
@@ -52,6 +53,11 @@ class ReplayJob:
         engine: makes the engines, see `Session`.
         threads: that share a large emission, see `usable_threads`.
 
+    Attributes:
+        advice: a line where the work on the first second took longer than the second.
+        assumptions: what the recording leaves open, and how that was decided.
+        interrupted: whether a signal ended it.
+
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
     """
@@ -59,10 +65,10 @@ class ReplayJob:
     def __init__(
         self,
         recording: RecordingPath | Recording,
-        model: ModelSource,
+        model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
-        emit: str | EmitPolicy = "auto",
+        emit: str | EmitPolicy = "bin",
         speed: float | None = None,
         topic: str | None = None,
         reading: ReadOptions = AS_IT_IS,
@@ -90,6 +96,7 @@ class ReplayJob:
             if split is not None and split not in {label.split for label in rec.labels}:
                 raise InputError(f"{rec.path}: has no samples of split {split!r}")
         self._labels = reader.labels if reader else ()
+        self.advice: list[str] = []
         self._session = Session(
             self._encoder,
             self._policy,
@@ -98,8 +105,9 @@ class ReplayJob:
             clock=time.perf_counter,
             engine=engine,
             threads=usable_threads(threads),
+            load=Load(self._encoder.geometry, self.advice.append),
         )
-        self._seconds = 0.0
+        self._seconds = self._compile_seconds = 0.0
         self.interrupted = False
         self._played: Recording | None = None
         self._pipeline: Pipeline[Packet | Label, Emission] | None = None
@@ -110,8 +118,11 @@ class ReplayJob:
         self, sinks: Callable[[], Sequence[Sink[Emission]]]
     ) -> Iterator[Pipeline[Packet | Label, Emission]]:
         """The pipeline of this replay into some sinks, with the recording open as long as the block runs."""
-        if self._speed is not None:
-            warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        started = time.perf_counter()
+        self._report("compiling", 0, 1, "kernels, kept for the next time")
+        warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        self._report("compiling", 1, 1, "")
+        self._compile_seconds = time.perf_counter() - started
         with self._opening() as rec:
             self._played = rec
             played = rec.played(
@@ -141,7 +152,8 @@ class ReplayJob:
 
             def sinks() -> Sequence[Sink[Emission]]:
                 held.enter_context(signals_wait())
-                return outputs.open(self._encoder.n_features, self._labels)
+                n_filters = self._encoder.n_filters
+                return outputs.open(self._encoder.n_features, self._labels, n_filters=n_filters)
 
             with self.opened(sinks) as pipeline:
                 started = time.perf_counter()
@@ -179,17 +191,23 @@ class ReplayJob:
             "events": stats.events,
             "seconds": round(self._seconds, 3),
             "events_per_s": round(stats.events / max(self._seconds, 1e-9)),
+            "compile_seconds": round(self._compile_seconds, 3),
             "emissions": stats.emissions,
+            "emit": str(self._session.policy),
             "samples": stats.samples,
         }
         if stats.correct is not None and stats.samples:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
-        if stats.unknown_labels:
-            result["unknown_labels"] = stats.unknown_labels
-        removed = dict(self.losses.removed)
+        result["unknown_labels"] = stats.unknown_labels
         return (
-            result | self.drops() | removed | {"saturated": stats.saturated, "interrupted": self.interrupted}
+            result
+            | self.drops()
+            | {
+                "removed": dict(self.losses.removed),
+                "saturated": stats.saturated,
+                "interrupted": self.interrupted,
+            }
         )
 
 
@@ -221,7 +239,7 @@ def checked_speed(speed: float | None) -> float | None:
     """The same speed.
 
     Raises:
-        InputError: it is no number above zero, and not None.
+        InputError: the speed is neither None nor a number above zero.
     """
     if speed is not None and not 0 < speed < 1e9:
         raise InputError(f"a speed of {speed} is not possible; give a number above zero, or None")
@@ -230,10 +248,10 @@ def checked_speed(speed: float | None) -> float | None:
 
 def replay(
     recording: RecordingPath | Recording,
-    model: ModelSource,
+    model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
-    emit: str | EmitPolicy = "auto",
+    emit: str | EmitPolicy = "bin",
     speed: float | None = None,
     topic: str | None = None,
     split: str | None = None,
@@ -252,9 +270,9 @@ def replay(
 
     Args:
         recording: path or URL; or an open recording, which stays open and is read in a thread meanwhile.
-        model: path of the encoder, or the encoder.
+        model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
-        emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
+        emit: `event`, `1000ev`, `10ms` (stream time), `bin` (of the model) or `auto`; or a policy.
         speed: stream seconds for each second of the clock; None for as fast as the program takes them.
         topic: event topic, where there are several.
         split: replay only samples of this split.

@@ -21,6 +21,7 @@ from streamfeat.events import Events, Resolution
 from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.load import Load
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
 
 __all__ = ["Session", "StreamItem"]
@@ -63,6 +64,7 @@ class Session:
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
         threads: of the engines, see `Engine`.
+        load: times the work of the first second, if somebody is to be told that it is too much.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -81,18 +83,19 @@ class Session:
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
         threads: int = 1,
+        load: Load | None = None,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
-        self.policy = policy
+        self.policy = policy = policy.with_bins(encoder.geometry.bin_us)
         self._every_event = policy == EmitPolicy("events", 1)
         if classifier and (learn_online or self._every_event):
             classifier = classifier.linear
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
-        self._clock, self._topic = clock, topic
+        self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = partial(engine, threads=threads)
@@ -102,6 +105,7 @@ class Session:
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
         self._log_time_ns = self._source_ns = 0
+        self._is_label_new = False
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -133,6 +137,7 @@ class Session:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
         self._state = snapshot.state.resumed(self._state.every_us)
+        self._is_label_new = self._state.is_untouched
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -150,9 +155,11 @@ class Session:
         elif isinstance(item, Label):
             yield from self._finish_sample()
             self._state.open_sample(item)
+            self._is_label_new = True
             self._restart()
         else:
-            yield from self._process_packet(item)
+            work = self._process_packet(item)
+            yield from self._load.timed(work, item) if self._load and not self._load.is_done else work
 
     def _process_packet(self, packet: Packet) -> Iterator[Emission]:
         state = self._state
@@ -163,6 +170,7 @@ class Session:
         events = packet.events
         if len(events) == 0:
             return
+        self._is_label_new = False
         engine = self._engine_for(packet.resolution)
         valid = _valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
@@ -199,7 +207,9 @@ class Session:
         if self._state.epoch is None:
             self._state.epoch = epoch
             return
-        yield from self._finish_sample()
+        # A label right before the first packet of a new clock is of that clock.
+        if not self._is_label_new:
+            yield from self._finish_sample()
         self._state.begin_epoch(epoch)
         self._restart()
 
@@ -289,7 +299,12 @@ class Session:
             topic=self._topic,
             incomplete=incomplete,
             source_ns=self._source_ns,
+            active_volumes=self._active_volumes(),
         )
+
+    def _active_volumes(self) -> int | None:
+        """Counting them is nothing beside an emission, but much beside one event."""
+        return self._engine.stats().active_volumes if self._engine and not self._every_event else None
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)

@@ -7,20 +7,26 @@ Not here: queues and tasks (`pipeline`), and what an emission holds (`emission`)
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO, TypeVar
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import unwritable
+from streamfeat.files.outputs import OutputFile
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.emission import Emission
 
 __all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record", "open_sinks"]
 
 _LINES_A_SECOND = 4.0
+_FILTERS_SHOWN = 3
+_ABSOLUTE_US = 86_400_000_000
+"""Stream times beyond a day are no time since a camera began."""
 
 T = TypeVar("T", contravariant=True)
 
@@ -82,21 +88,17 @@ def emission_record(emission: Emission, *, features: bool = False) -> dict[str, 
 
 
 class JsonLinesSink:
-    """One JSON object a line; to a file, which appears when complete, or to an open stream."""
+    """One JSON object a line; to a file (see `OutputFile`) or an open stream."""
 
     def __init__(self, target: Path | TextIO, *, features: bool = False) -> None:
         """Open the target.
 
         Raises:
-            InputError: the file cannot be written.
+            InputError: the file cannot be written, see `OutputFile`.
         """
-        self._path = target if isinstance(target, Path) else None
         self._features = features
-        try:
-            self._part = self._path.with_name(self._path.name + ".part") if self._path else None
-            self._stream = self._part.open("w") if self._part else target
-        except OSError as error:
-            raise InputError(f"{target}: cannot write there: {error.strerror}") from error
+        self._output = OutputFile(target) if isinstance(target, Path) else None
+        self._stream = None if isinstance(target, Path) else target
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Write a line for each emission.
@@ -106,9 +108,13 @@ class JsonLinesSink:
         """
         lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
         with self._explaining():
-            self._stream.writelines(lines)  # type: ignore[union-attr]
-            if self._path is None:
-                self._stream.flush()  # type: ignore[union-attr]
+            if self._stream:
+                self._stream.writelines(lines)
+                self._stream.flush()
+            elif self._output:
+                self._output.file.writelines(line.encode() for line in lines)
+                if self._output.part is None:
+                    self._output.file.flush()
 
     def close(self, *, failed: bool) -> None:
         """Put the file in its place, or remove it.
@@ -116,15 +122,13 @@ class JsonLinesSink:
         Raises:
             InputError: as for `write`; the file is removed then.
         """
-        if self._path is None or self._part is None:
+        if self._output is None:
             return  # each write was flushed
-        try:
-            with suppress(OSError) if failed else self._explaining():
-                self._stream.close()  # type: ignore[union-attr]
-            if not failed:
-                self._part.replace(self._path)
-        finally:
-            self._part.unlink(missing_ok=True)
+        if failed:
+            self._output.abandon()
+            return
+        with self._explaining():
+            self._output.close()
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:
@@ -133,8 +137,7 @@ class JsonLinesSink:
         except BrokenPipeError:
             raise  # the reader has enough, as `head` has, and nothing is wrong
         except OSError as error:
-            where = self._path or "standard output"
-            raise InputError(f"{where}: cannot be written: {error.strerror}; is there room?") from None
+            raise unwritable(self._output.path if self._output else Path("standard output"), error) from None
 
 
 class RecordingSink:
@@ -170,19 +173,32 @@ class RecordingSink:
 
 
 class TerminalSink:
-    """A line for each labelled sample, or for each second without labels; never a flood.
+    """A line for each labelled sample, or of what happens between them; four a second, never a flood.
+
+    Without labels a line says how fast events come, how many local volumes have some, and, without a
+    classifier, which filters moved most since the line before. Times of a camera that counts from 1970 are
+    counted from the first emission.
 
     Args:
-        console: where to print.
+        console: where to print; what is too narrow for all gets the beginning.
         clock: seconds, monotonic.
         every_sample: show each labelled sample, however fast they come.
+        n_filters: of the encoder; 0 to say nothing of filters.
     """
 
     def __init__(
-        self, console: Console, clock: Callable[[], float] = time.monotonic, *, every_sample: bool = False
+        self,
+        console: Console,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        every_sample: bool = False,
+        n_filters: int = 0,
     ) -> None:
         """Start with nothing seen."""
         self._console = console
+        self._n_filters = n_filters
+        self._zero_us: int | None = None
+        self._before: dict[str, Emission] = {}
         self._every_sample = every_sample
         self._clock = clock
         self._next = 0.0
@@ -192,6 +208,9 @@ class TerminalSink:
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Count every emission, and show one where it is time to."""
+        if self._zero_us is None:
+            first_us = emissions[0].t_us
+            self._zero_us = first_us if first_us > _ABSOLUTE_US else 0
         finals = [e for e in emissions if e.final]
         if self._every_sample:
             for e in finals:
@@ -211,7 +230,7 @@ class TerminalSink:
         if self._clock() < self._next:
             return
         self._skipped -= shown.final
-        self._next = self._clock() + (1 / _LINES_A_SECOND if shown.final else 1.0)
+        self._next = self._clock() + 1 / _LINES_A_SECOND
         self._console.print(self._line(shown), highlight=False)
 
     def close(self, *, failed: bool) -> None:
@@ -220,15 +239,17 @@ class TerminalSink:
             self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
 
     def _line(self, e: Emission) -> Text:
-        line = Text()
-        line.append(f"{e.t_us / 1e6:8.2f} s ", style="dim")
+        line = Text(no_wrap=True, overflow="crop")
+        line.append(f"{(e.t_us - (self._zero_us or 0)) / 1e6:8.2f} s  ", style="dim")
         if e.topic:
             line.append(f"{e.topic}  ", style="cyan")
-        line.append(f"{e.n_events:>10,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
             line.append(f"{e.prediction:<{max(map(len, e.labels))}}", style="bold")
             line.append(f" {first - second:+6.2f}  ", style="dim")
+        before = self._before.get(e.topic)
+        self._before[e.topic] = e
+        line.append(f"{_rate(before, e):>8}/s  ")
         if e.sample and e.final:
             if e.correct is None:
                 line.append(f"is {e.sample.label}")
@@ -238,9 +259,33 @@ class TerminalSink:
                 line.append(f"is {e.sample.label}", style="red")
             if e.labels:
                 line.append(f"  {100 * self._correct / self._samples:.1f} % of {self._samples}", style="dim")
-        elif e.prediction is None:
-            line.append("sum of features ", style="dim")
-            line.append(f"{float(abs(e.features).sum()):9.1f}")
+        elif e.active_volumes is not None:
+            line.append(f"{e.active_volumes:>6,} active", style="dim")
         if e.incomplete:
             line.append("  incomplete", style="yellow")
+        if e.prediction is None and self._n_filters:
+            line.append("  filters ", style="dim")
+            line.append(_moved(before, e, self._n_filters))
         return line
+
+
+def _rate(before: Emission | None, e: Emission) -> str:
+    """Events a second of stream time since the emission before, in four letters or less."""
+    passed_us = e.t_us - before.t_us if before else 0
+    if before is None or passed_us <= 0:
+        return "-"
+    rate = 1e6 * (e.n_events - before.n_events) / passed_us
+    for limit, unit, name in ((999.5e6, 1e9, "G"), (999.5e3, 1e6, "M"), (999.5, 1e3, "k")):
+        if rate >= limit:
+            value = rate / unit
+            return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}{name}"
+    return f"{rate:.0f}"
+
+
+def _moved(before: Emission | None, e: Emission, n_filters: int) -> str:
+    """The filters whose pooled codes rose (+) or fell (-) most, all cells and both signs together."""
+    change = e.features - before.features if before else e.features
+    of_filter = change.reshape(-1, n_filters).sum(axis=0)
+    most = np.argsort(-np.abs(of_filter), kind="stable")[:_FILTERS_SHOWN]
+    said = [f"{k + 1}{'+' if of_filter[k] > 0 else '-'}" for k in most.tolist() if of_filter[k]]
+    return " ".join(said) or "at rest"

@@ -55,7 +55,7 @@ class SessionStats:
         """Read what `asdict` wrote.
 
         Raises:
-            InputError: it is not that.
+            InputError: the values are not such counts.
         """
         names = [field.name for field in fields(cls) if field.name != "correct"]
         return cls(**{name: values.whole(name) for name in names}, correct=values.maybe("correct"))
@@ -120,10 +120,18 @@ class SessionState:
         """Whether labelled samples come with this stream and none is open: silence tells nothing then."""
         return self.seen_label and self.sample is None
 
+    @property
+    def is_untouched(self) -> bool:
+        """Whether a sample is open of which no event has come."""
+        return self.sample is not None and self.last_us == self.sample.start_us and not self.unread
+
     def begin_epoch(self, epoch: int) -> None:
-        """Start anew with the camera's clock: an empty window, with nothing known of what came before."""
-        self.begin(0)
-        self.lost = True
+        """Start anew with the camera's clock: an empty window, with nothing known of what came before.
+
+        A sample that is still open has been labelled in the new clock: of its window nothing is missing.
+        """
+        self.begin(self.sample.start_us if self.sample else 0)
+        self.lost = self.sample is None
         self.epoch = epoch
 
     def place(self, t: NDArray[np.int64], valid: NDArray[np.bool_], window_us: int) -> NDArray[np.int64]:
@@ -194,7 +202,7 @@ class SessionState:
         """Read what `asdict` wrote, of a live stream.
 
         Raises:
-            InputError: it is not that, or no session could be there.
+            InputError: the values are not a state, or not one that a session can be in.
         """
         origin_us, last_us = (
             values.whole("origin_us", -_LATEST_US, _LATEST_US),

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from streamfeat.errors import InputError
+from streamfeat.files.atomic import unwritable
+from streamfeat.files.outputs import OutputFile
 from streamfeat.stream.emission import Emission
 
 __all__ = ["TableSink"]
@@ -42,19 +44,18 @@ class TableSink:
 
     def __init__(self, path: Path, n_features: int, labels: Sequence[str] = ()) -> None:
         """Open the file."""
-        self._path, self._part = path, path.with_name(path.name + ".part")
         self._n_features = n_features
         self._waiting: list[Emission] = []
         self._pa = _library("pyarrow", path)
         self._schema = self._make_schema(labels)
+        is_parquet = path.suffix.lower() == ".parquet"
+        open_table = _library("pyarrow.parquet", path).ParquetWriter if is_parquet else self._pa.ipc.new_file
+        self._output = OutputFile(path)
         try:
-            self._file = self._part.open("wb")
+            self._writer = open_table(self._output.file, self._schema)
         except OSError as error:
-            raise InputError(f"{path}: cannot write there: {error.strerror}") from error
-        if path.suffix.lower() == ".parquet":
-            self._writer = _library("pyarrow.parquet", path).ParquetWriter(self._file, self._schema)
-        else:
-            self._writer = self._pa.ipc.new_file(self._file, self._schema)
+            self._output.abandon()
+            raise unwritable(path, error) from None
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Keep the emissions until there are enough for a group of rows.
@@ -73,26 +74,26 @@ class TableSink:
         Raises:
             InputError: as for `write`; the file is removed then.
         """
+        if failed:
+            with suppress(OSError):
+                self._writer.close()
+            self._output.abandon()
+            return
         try:
-            with suppress(OSError) if failed else self._explaining():
-                if not failed and self._waiting:
+            with self._explaining():
+                if self._waiting:
                     self._write_group()
                 self._writer.close()
-                self._file.close()
-            if not failed:
-                self._part.replace(self._path)
+                self._output.close()
         finally:
-            with suppress(OSError):  # once more, where the first could not write what was left
-                self._file.close()
-            self._part.unlink(missing_ok=True)
+            self._output.abandon()
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{self._path}: cannot be written: {reason}; is there room?") from None
+            raise unwritable(self._output.path, error) from None
 
     def _make_schema(self, labels: Sequence[str]) -> Any:
         pa = self._pa

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
@@ -19,16 +19,19 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
-from streamfeat.files.atomic import replacing, write_atomically
+from streamfeat.files.atomic import write_atomically
 from streamfeat.files.locations import Location
+from streamfeat.files.outputs import OutputFile
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.warming import warm_up
+from streamfeat.view.labelling import LabelSheet
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
 from streamfeat.view.page import page
+from streamfeat.view.player import Piece
 from streamfeat.view.server import PageServer
 from streamfeat.view.sink import Shows, ViewSink, about
 from streamfeat.view.sources import PlayJob, WatchJob
@@ -68,6 +71,7 @@ class View:
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
         loop: start a recording again at its end.
         threads: that share a large emission, see `usable_threads`.
+        labels: labels of the recording that the page changes.
         say: told addresses, and what is waited for.
         options: further ones of `PlayJob`, `WatchJob` or `ListenJob`.
 
@@ -90,6 +94,7 @@ class View:
         speed: float | None = 1.0,
         loop: bool = False,
         threads: int | None = None,
+        labels: LabelSheet | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
@@ -112,6 +117,7 @@ class View:
         self._is_recording = isinstance(source, Location)
         self._boards: list[Shows] = []
         self._page: PageServer | None = None
+        self._sheet = labels
         self._sink = ViewSink(
             self._boards,
             self._encoder,
@@ -135,6 +141,7 @@ class View:
                 threads=threads,
                 on_player=self._tell("player"),
                 on_timeline=self._tell("timeline") if web_port is not None else None,
+                on_pieces=self._place,
                 **options,
             )
         elif model:
@@ -203,7 +210,8 @@ class View:
 
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
-        return self._job.result() | {"frames": self._sink.frames, "frames_skipped": self._sink.skipped}
+        result = self._job.result() | {"frames": self._sink.frames, "frames_skipped": self._sink.skipped}
+        return result | (self._sheet.result() if self._sheet else {})
 
     def _open(self, opened: ExitStack) -> None:
         """Open what is shown on."""
@@ -211,8 +219,8 @@ class View:
         if self._recording_out:
             from streamfeat.view.channels import FileBoard
 
-            path = opened.enter_context(replacing(self._recording_out))
-            file = FileBoard(known, path, self._recording_out)
+            output = opened.enter_context(OutputFile(self._recording_out))
+            file = FileBoard(known, output.part or output.path, output.path)
             opened.callback(file.close)
             self._boards.append(file)
         if self._foxglove_port is not None:
@@ -230,6 +238,7 @@ class View:
             self._boards.append(server)
             self._page = server
             server.record("", "about", 0, known | {"recording": self._is_recording})
+            self._show_labels()
             self._say(f"page: {server.address}")
             if self._open_browser:
                 Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
@@ -243,9 +252,23 @@ class View:
 
         return tell
 
+    def _place(self, pieces: Sequence[Piece], end_us: int) -> None:
+        """Tell labels which stream time is played when."""
+        if self._sheet:
+            self._sheet.read_to(pieces, end_us)
+            self._show_labels()
+
+    def _show_labels(self) -> None:
+        if self._sheet:
+            self._tell("labels")(self._sheet.record())
+
     def _asked(self, asked: dict[str, Any]) -> None:
         """Do what a button of the page asks for; what makes no sense is left alone."""
         if not isinstance(self._job, PlayJob):
+            return
+        if self._sheet and asked["op"] in LabelSheet.OPERATIONS:
+            self._sheet.do(asked)
+            self._show_labels()
             return
         player, op, value = self._job.player, asked["op"], asked.get("value")
         number = float(value) if isinstance(value, int | float) and 0 <= value < 1e9 else None

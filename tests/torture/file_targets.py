@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import camera_files_scene as scenes
 import lz4.frame
 import numpy as np
 import zstandard
@@ -25,6 +26,7 @@ from streamfeat.convert.datasets import convert
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events
 from streamfeat.messages.cdr import EventArray, LabelMessage
 from streamfeat.recordings.reader import Label, Packet, open_recording
@@ -122,23 +124,9 @@ def _recover_recording(data: bytes) -> bytes:
 # --- models and classifiers
 
 
-def _tiny_model(formulation: Any, encoding: Any) -> Encoder:
-    rng = np.random.default_rng(1)
-    d = _TINY.entries
-    return Encoder.build(
-        _TINY,
-        formulation=formulation,
-        encoding=encoding,
-        threshold=0.3,
-        filters=rng.standard_normal((3, d)),
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
-
-
 def _model_seeds() -> list[bytes]:
     kinds = [("direct", "split"), ("direct", "triangle"), ("inverse", "soft"), ("inverse", "split")]
-    return [_written(_tiny_model(*kind).save) for kind in kinds]
+    return [_written(random_encoder(1, _TINY, 3, *kind, threshold=0.3).save) for kind in kinds]
 
 
 def _load_model(data: bytes) -> bytes:
@@ -340,9 +328,59 @@ def _aedat4(compression: int, n: int) -> bytes:
     return b"".join(parts)
 
 
+def _scene(n: int = 12) -> Events:
+    return some_events(n)
+
+
+def _evt21_seeds() -> list[bytes]:
+    header = b"% evt 2.1\n% geometry 64x48\n% end\n"
+    return [scenes.evt21(_scene(), header, is_swapped=is_swapped) for is_swapped in (False, True)]
+
+
+def _aedat_seeds() -> list[bytes]:
+    events = _scene()
+    plain = [scenes.aedat1(events), scenes.aedat1(events, b""), scenes.aedat2(events), scenes.aedat3(events)]
+    return [*plain, scenes.aedat2(events, "DVS128"), scenes.aedat2(events, "Davis346red")]
+
+
+def _event_stream_seeds() -> list[bytes]:
+    return [scenes.event_stream(_scene(), is_atis=is_atis) for is_atis in (False, True)]
+
+
+def _table_seeds() -> list[bytes]:
+    rows = list(_words(_scene()))
+    forms = (
+        ("t;x;y;p\n", lambda x, y, p, t: f"{t / 1e6:.6f};{x};{y};{p}".replace(".", ",")),
+        ('"x","y","on","t_us"\r\n', lambda x, y, p, t: f'"{x}","{y}","{bool(p)}","{t}"\r'),
+        ("%geometry:64,48\n", lambda x, y, p, t: f"{x},{y},{p},{t} # seen"),
+        ("", lambda x, y, p, t: f"{x}\t{y}\t{p}\t{t / 1e6:.6f}".replace(".", ",")),
+        ("id|t|x|y|p|of\n", lambda x, y, p, t: f"7|{t}|{x}|{y}|{2 * p - 1}|car"),
+    )
+    return [(head + "".join(f"{form(*row)}\n" for row in rows)).encode() for head, form in forms]
+
+
+def _npy_seeds() -> list[bytes]:
+    made = []
+    for array in (scenes.table(_scene(), "txyp"), scenes.table(_scene(), "xytp").T.astype(">f4"), _scene()):
+        out = io.BytesIO()
+        np.save(out, array)
+        made.append(out.getvalue())
+    return made
+
+
+def _ecf_seeds() -> list[bytes]:
+    import h5py
+
+    def write(path: Path, mode: int) -> None:
+        scenes.ecf_file(h5py, path, [scenes.ecf(some_events(250), mode)])
+
+    return [_written(functools.partial(_call, write, (mode,)), "seed.h5") for mode in (0, 1, 2)]
+
+
 _XML_WORDS = (b"<node name='0'>", b"<attr key='sizeX'>", b"</node>", b"99999", b"<!DOCTYPE a>", b"EVTS")
 _HEAD_WORDS = (b"% ", b"\n", b"% end\n", b"geometry ", b"640x480", b"width=", b"height=", b"%", b"evt 3.0")
 _CAMERA_WORDS = (*_HEAD_WORDS, b"99999", b"0x0", b"format EVT3;", b"% Width 99999999\n", b"\x00\x08")
+_AEDAT_WORDS = (b"#!AER-DAT1", b"#!AER-DAT2.0\r\n", b"# AEChip: DVS128\r\n", b"Davis640", b"#Format: RAW\r\n")
 _ROW_WORDS = (
     b"1e999",
     b"nan",
@@ -405,7 +443,7 @@ FILE_TARGETS = [
             mend,
             words,
             most=16_384 if runs < 5_000 else 4096,
-            kernels=name == "EVT3",
+            kernels=name in ("EVT3", "Event Stream"),
         )
         for name, ending, seeds, runs, mend, words in (
             ("DAT", "dat", _dat_seeds, 6_000, bytes, _CAMERA_WORDS),
@@ -416,6 +454,13 @@ FILE_TARGETS = [
             ("NumPy", "npz", _numpy_seeds, 4_000, mend_zip, _NUMPY_WORDS),
             ("HDF5", "h5", _hdf5_seeds, 12, bytes, ()),
             ("AEDAT4", "aedat4", _aedat4_seeds, 6_000, bytes, _XML_WORDS),
+            ("EVT2.1", "raw", _evt21_seeds, 5_000, bytes, _CAMERA_WORDS),
+            ("EVT4", "raw", lambda: [scenes.evt4(_scene(), b"% evt 4.0\n")], 5_000, bytes, _CAMERA_WORDS),
+            ("AEDAT 1 to 3", "aedat", _aedat_seeds, 5_000, bytes, _AEDAT_WORDS),
+            ("Event Stream", "es", _event_stream_seeds, 6_000, bytes, ()),
+            ("table", "csv", _table_seeds, 6_000, bytes, (*_EVENT_LINES, b";", b"|", b'"', b"\r\n")),
+            ("NumPy array", "npy", _npy_seeds, 5_000, bytes, _NUMPY_WORDS),
+            ("ECF in HDF5", "h5", _ecf_seeds, 12, bytes, ()),
         )
     ),
 ]

@@ -26,20 +26,19 @@ from streamfeat.events import Resolution  # noqa: E402
 from tools.bench import machine, material, tables  # noqa: E402
 from tools.bench.cluster import measure_cluster  # noqa: E402
 from tools.bench.direct import measure_floors, measure_peers  # noqa: E402
-from tools.bench.fleet_plan import PACKET_US, plan  # noqa: E402
+from tools.bench.fleet_plan import plan  # noqa: E402
 from tools.bench.floor import compiler  # noqa: E402
-from tools.bench.growth import measure_growth  # noqa: E402
-from tools.bench.growth_model import Constants  # noqa: E402
-from tools.bench.growth_picture import draw_growth  # noqa: E402
+from tools.bench.growth import event_ns, measure_growth  # noqa: E402
 from tools.bench.growth_streams import Load  # noqa: E402
 from tools.bench.ingest import measure_ingest  # noqa: E402
 from tools.bench.inverse import measure_inverse  # noqa: E402
 from tools.bench.kernel_rows import measure_kernels  # noqa: E402
 from tools.bench.latencies import measure_latency  # noqa: E402
 from tools.bench.overload import measure_overload  # noqa: E402
+from tools.bench.pictures import draw_growth, draw_scaling  # noqa: E402
 from tools.bench.precision import measure_memory, measure_precision  # noqa: E402
 from tools.bench.replays import measure_replay  # noqa: E402
-from tools.bench.scaling import draw_scaling, measure_scaling  # noqa: E402
+from tools.bench.scaling import measure_scaling  # noqa: E402
 from tools.bench.steps import measure_learning  # noqa: E402
 from tools.bench.timing import stolen_seconds  # noqa: E402
 
@@ -191,15 +190,11 @@ def _resolution(text: str) -> Resolution:
 
 
 def _plan(options: argparse.Namespace) -> int:
-    """Machines for so many cameras, by the constants that the part `growth` found."""
-    growth = _results_so_far(options.json)["parts"].get("growth")
-    if growth is None:
-        raise sf.InputError(f"{options.json}: has no part growth; run python tools/bench --only growth")
+    """Machines for so many cameras, by what an event takes here."""
     n, rate, filters = options.plan
     load = Load(options.emit, filters, options.stride, options.resolution, rate=rate)
-    packet_us = growth["fleet"]["packet_us"] or PACKET_US
-    events, constants = material.Material(options.recording), Constants(**growth["constants"])
-    print(json.dumps(plan(constants, packet_us, events, load, n, options.cores), indent=1))
+    ns = event_ns(material.Material(options.recording), load)
+    print(json.dumps(plan(ns, load, n, options.cores), indent=1))
     return 0
 
 

@@ -1,7 +1,7 @@
 """How many machines so many cameras need.
 
 Lives here: the arithmetic from the cost of an event to processes and machines.
-Not here: what an event costs (`growth_model`).
+Not here: what an event costs (`growth`).
 """
 
 import math
@@ -9,34 +9,29 @@ from typing import Any
 
 from streamfeat.errors import InputError
 from streamfeat.live.shard import Shard
-from tools.bench.growth_fleet import PACKETS_PER_S
-from tools.bench.growth_model import Constants, work_of
-from tools.bench.growth_streams import Load, Stream
-from tools.bench.material import Material
+from tools.bench.growth_streams import SLICE_US, Load
 
 __all__ = ["HEADROOM", "plan"]
 
 HEADROOM = 0.5
 """Share of a core that is planned with: the other half is for bursts, restarts and what else runs there."""
-PACKET_US = 1000.0
-"""Processor time of a packet beyond its events, where it was not measured: receiving, decoding, two threads,
-an emission put on the network."""
+PACKETS_PER_S = 1_000_000 // SLICE_US
+"""Of one camera."""
+PACKET_US = 940.0
+"""Processor time of a packet beyond its events, see the README: receiving, decoding, two threads, an emission
+put on the network."""
 OTHERS_US = 200.0
 """Processor time of a packet of 32 kB that is another process's, see `tools/live_bench shards`."""
 
 
-def plan(
-    constants: Constants, packet_us: float, material: Material, load: Load, cameras: int, cores: int
-) -> dict[str, Any]:
+def plan(event_ns: float, load: Load, cameras: int, cores: int) -> dict[str, Any]:
     """Machines, with a process for each of their cores and `--shard`.
 
     Shares are even on average only: cameras are given names, to see what the heaviest process would have. A
     process with more than a core of work emits less often than it was asked to, and drops nothing.
 
     Args:
-        constants: of such a machine.
-        packet_us: of it, see `measure_fleet`.
-        material: what the cameras see.
+        event_ns: what an event costs an engine on such a machine.
         load: one camera.
         cameras: how many there are.
         cores: of one machine.
@@ -44,10 +39,8 @@ def plan(
     Raises:
         InputError: one camera is more than a core can carry.
     """
-    work = work_of(load, Stream(material, load, 20_000))
-    event_ns = constants.predict(work)
     engine = event_ns * load.rate / 1e9
-    busy = engine + PACKETS_PER_S * packet_us / 1e6
+    busy = engine + PACKETS_PER_S * PACKET_US / 1e6
     if busy > 1:
         raise InputError(
             f"one camera keeps {busy:.2f} cores busy, and a process has one: emit less often (--emit auto "

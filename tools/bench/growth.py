@@ -1,17 +1,12 @@
-"""How the cost of events grows with filters, stride, resolution, rate, cameras and processes.
+"""How the cost of events grows with filters, stride, resolution, rate and cameras.
 
-Lives here: the part `growth`: loads timed in turns, the latency of single events and emissions, processes
-beside each other.
-Not here: what should come out (`growth_model`), a whole listener (`growth_fleet`), how it is shown (`tables`,
-`growth_picture`).
+Lives here: the part `growth`: loads timed in turns, the latency of single events and emissions.
+Not here: the loads (`growth_streams`), how it is shown (`tables`, `pictures`).
 """
 
-import multiprocessing
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,13 +17,11 @@ import streamfeat as sf
 from streamfeat.events import Events
 from streamfeat.latency.stopwatch import follow_timed
 from streamfeat.report.machine import Disturbance
-from tools.bench.growth_fleet import measure_fleet
-from tools.bench.growth_model import Constants, work_of
-from tools.bench.growth_streams import FIT, Load, Stream, sweeps
+from tools.bench.growth_streams import Load, Stream, sweeps
 from tools.bench.material import Material, Setting
 from tools.bench.timing import Contestant, race
 
-__all__ = ["measure_growth"]
+__all__ = ["event_ns", "measure_growth"]
 
 Report = dict[str, Any]
 
@@ -87,80 +80,33 @@ class Run:
 
 
 def measure_growth(setting: Setting) -> Report:
-    """Every load, measured and predicted; then cameras of one listener, and processes side by side."""
-    quick, material = setting.quick, setting.material
-    report = _measure(material, sweeps(quick), 1 if quick else 9, 1000 if quick else 20_000, tails=not quick)
-    counts, seconds = ((1,), 0.2) if quick else ((1, 2, 4), 5.0)
-    constants, camera = Constants(**report["constants"]), Load("10ms", rate=100_000)
-    fleet = measure_fleet(material, camera, counts, seconds, constants, 1 if quick else 3)
-    processes = _measure_processes(material.path, Load("10ms"), counts[:2], seconds)
-    return report | {"fleet": fleet, "processes": processes}
-
-
-def _measure(material: Material, loads: list[Load], rounds: int, events: int, *, tails: bool) -> Report:
-    """Time loads in turns, fit the constants to the first ones, and predict all."""
-    disturbance = Disturbance()
-    works, contestants, runs = [], {}, []
+    """Time every load in turns, and then the latencies of each."""
+    quick, disturbance = setting.quick, Disturbance()
+    loads, contestants, runs = sweeps(quick), {}, []
     for load in loads:
-        stream = Stream(material, load, events)
-        works.append(work_of(load, stream))
+        stream = Stream(setting.material, load, 1000 if quick else 20_000)
         runs.append(Run(load, stream))
         contestants[load.name] = Contestant(runs[-1].go, runs[-1].n, runs[-1].go_on)
     with threadpool_limits(1):
-        result = race(contestants, rounds)
-    figures = [result.figure(load.name) for load in loads]
-    ns = [figure["p50"] for figure in figures]
-    fitted = [loads.index(load) for load in FIT]
-    constants = Constants.fit([works[i] for i in fitted], [ns[i] for i in fitted])
+        result = race(contestants, 1 if quick else 9)
     rows = []
-    for load, work, figure, run in zip(loads, works, figures, runs, strict=True):
-        predicted = constants.predict(work)
-        row = asdict(load) | asdict(work) | {"fitted": load in FIT, "ns": figure}
-        row |= {"predicted_ns": predicted, "ratio": figure["p50"] / predicted}
-        if tails:
+    for load, run in zip(loads, runs, strict=True):
+        row: Report = asdict(load) | {"ns": result.figure(load.name)}
+        if not quick:
             p50, p99 = np.percentile(run.latencies(), [50, 99])
             row |= {"latency_p50_us": p50 / 1e3, "latency_p99_us": p99 / 1e3}
         rows.append(row)
     return {
         "steal": disturbance.steal_share(),
         "discarded_rounds": result.discarded,
-        "recording": material.describe(),
-        "constants": asdict(constants),
+        "recording": setting.material.describe(),
         "rows": rows,
     }
 
 
-def _measure_processes(recording: Path, load: Load, counts: tuple[int, ...], seconds: float) -> Report:
-    """Events a second of so many processes at once, on the wall and by their own processor time."""
-    found = {}
-    context = multiprocessing.get_context("spawn")
-    for count in counts:
-        ready = context.Barrier(count)
-        disturbance = Disturbance()
-        with ProcessPoolExecutor(count, context, initializer=_share, initargs=(ready,)) as pool:
-            jobs = [pool.submit(_process, recording, load, seconds) for _ in range(count)]
-            taken = [job.result() for job in jobs]
-        events = sum(n for n, _, _ in taken)
-        found[str(count)] = {
-            "events_per_s": events / max(wall for _, wall, _ in taken),
-            "events_per_processor_s": events / sum(cpu for _, _, cpu in taken),
-            "steal": disturbance.steal_share(),
-        }
-    return {"load": load.name} | found
-
-
-def _share(ready: Any) -> None:
-    global _ready
-    _ready = ready
-
-
-def _process(recording: Path, load: Load, seconds: float) -> tuple[int, float, float]:
-    run = Run(load, Stream(Material(recording), load, 20_000))
-    run.go()
-    _ready.wait()
-    begun, cpu, n = time.perf_counter(), time.process_time(), 0
-    while time.perf_counter() - begun < seconds:
-        run.go_on()
-        run.go()
-        n += run.n
-    return n, time.perf_counter() - begun, time.process_time() - cpu
+def event_ns(material: Material, load: Load, rounds: int = 5) -> float:
+    """Nanoseconds of the processor that an event of a load costs its engine."""
+    run = Run(load, Stream(material, load, 20_000))
+    with threadpool_limits(1):
+        result = race({load.name: Contestant(run.go, run.n, run.go_on)}, rounds)
+    return result.figure(load.name)["p50"]

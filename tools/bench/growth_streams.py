@@ -1,7 +1,7 @@
 """Loads of an engine, and the streams of events that they are measured on.
 
 Lives here: loads, and putting recorded samples down on a sensor until there are as many events as asked.
-Not here: timing (`growth`), predicting (`growth_model`).
+Not here: timing (`growth`).
 """
 
 from dataclasses import dataclass, replace
@@ -10,13 +10,12 @@ from functools import cached_property
 import numpy as np
 
 import streamfeat as sf
-from streamfeat.engine.operator import LANES
 from streamfeat.events import Events, Resolution
 from tools.bench.direct import with_encoding
 from tools.bench.material import Material
 from tools.bench.scaling import flat_encoder
 
-__all__ = ["FIT", "SLICE_US", "Load", "Stream", "sweeps"]
+__all__ = ["SLICE_US", "Load", "Stream", "sweeps"]
 
 SLICE_US = 10_000
 
@@ -55,31 +54,22 @@ class Load:
     def geometry(self) -> sf.Geometry:
         return sf.Geometry(patch=12, stride=self.stride, n_bins=3, bin_us=self.bin_us, max_count=1)
 
-    @property
-    def padded(self) -> int:
-        """Filters that kernels walk over."""
-        return -(-self.filters // LANES) * LANES
-
     def encoder(self) -> sf.Encoder:
         encoder = flat_encoder(self.geometry, self.filters)
         return with_encoding(encoder, self.geometry, "split")
 
 
-FIT = [Load(emit, filters=k) for emit in ("event", "10ms") for k in (100, 800)]
-"""What the constants come from."""
-
-
 def sweeps(quick: bool) -> list[Load]:
-    """All loads, those of the fit first."""
-    found = list(FIT)
+    """All loads: one quantity at a time moves away from the base."""
+    found = []
     for emit in ("event", "10ms"):
         base = Load(emit)
-        found += [replace(base, filters=k) for k in (200, 400, 1600)]
+        found += [replace(base, filters=k) for k in (100, 200, 400, 800, 1600)]
         found += [replace(base, stride=stride) for stride in (2, 6, 12)]
         found += [replace(base, resolution=r) for r in ((60, 80), (240, 320), (480, 640))]
         found += [replace(base, rate=rate) for rate in (50_000, 800_000)]
         found += [replace(base, cameras=n) for n in (2, 4, 8)]
-    return [*FIT, *(replace(FIT[0], emit=emit, stride=12) for emit in ("event", "10ms"))] if quick else found
+    return [Load(emit) for emit in ("event", "10ms")] if quick else found
 
 
 class Stream:

@@ -17,6 +17,7 @@ import streamfeat as sf
 from streamfeat.engine.window import count_window
 from tools.bench.inverse import whitened
 from tools.bench.material import Setting, Updates, encoder_of
+from tools.bench.scaling import flat_encoder
 
 __all__ = ["measure_memory", "measure_precision"]
 
@@ -82,17 +83,7 @@ def memory_of_engine(n_filters: int, *, look_ahead: bool) -> dict[str, Any]:
     """
     geometry = sf.Geometry(patch=12, stride=4, n_bins=7, bin_us=1000, downsample=4)
     rng = np.random.default_rng(0)
-    d = geometry.entries
-    filters = rng.normal(size=(n_filters, d)).astype(np.float32) / np.sqrt(d)
-    encoder = sf.Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="soft",
-        threshold=0.5,
-        filters=filters,
-        whitening=np.eye(d),
-        mean=np.zeros(d),
-    )
+    encoder = flat_encoder(geometry, n_filters)
     resolution = (480, 640)
     small = sf.Engine(encoder, (96, 96), look_ahead=look_ahead)
     _use(small, rng, 500)

@@ -1,24 +1,24 @@
 """How the cost of an event grows: the paper's table of complexity, measured.
 
-Lives here: the part `scaling` and its picture. Not here: peers.
+Lives here: the part `scaling`. Not here: peers, its picture (`pictures`).
 
 One quantity at a time moves away from the paper's geometry (K = 1700, patch 12, 7 bins, one volume for each
 event). An update of the direct formulation is O(K) whatever the volume's length d is, from scratch it is
 O(K d); the inverse formulation pays for its active atoms.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 import streamfeat as sf
+from streamfeat.engine.random_encoder import random_encoder
 from tools.bench.direct import follower
-from tools.bench.material import Setting, random_encoder
+from tools.bench.material import Setting, encoder_of_volumes
 from tools.bench.timing import Contestant, race
 
-__all__ = ["draw_scaling", "measure_scaling"]
+__all__ = ["measure_scaling"]
 
 SWEEPS: dict[str, tuple[int, ...]] = {
     "K": (100, 200, 400, 800, 1700, 3400),
@@ -71,7 +71,7 @@ def _inverse(setting: Setting) -> dict[str, Any]:
     for k in INVERSE[: 2 if setting.quick else None]:
         burst = setting.material.burst(geometry, 10 if setting.quick else 40)
         for formulation, parameters in (("direct", {}), ("inverse", {"gap": 1e-4})):
-            encoder = random_encoder(setting.material, geometry, k, formulation, **parameters)
+            encoder = encoder_of_volumes(setting.material, geometry, k, formulation, **parameters)
             contestants[f"{formulation} {k}"], _, _ = follower(burst, encoder)
     result = race(contestants, setting.rounds(5))
     return {
@@ -86,62 +86,9 @@ def _inverse(setting: Setting) -> dict[str, Any]:
 
 def flat_encoder(geometry: sf.Geometry, n_filters: int) -> sf.Encoder:
     """Random filters without whitening: the direct formulation costs the same whatever they are."""
-    d = geometry.entries
-    filters = np.random.default_rng(0).normal(size=(n_filters, d)) / np.sqrt(d)
-    return sf.Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="soft",
-        threshold=0.5,
-        filters=filters,
-        whitening=np.eye(d),
-        mean=np.zeros(d),
-    )
+    return random_encoder(0, geometry, n_filters, threshold=0.5)
 
 
 def _product(encoder: sf.Encoder) -> Contestant:
     vector, out = np.ones(encoder.geometry.entries, np.float32), np.empty(encoder.n_filters, np.float32)
     return Contestant(lambda: np.dot(encoder.filters, vector, out=out))
-
-
-def draw_scaling(figures: dict[str, Any], target: Path) -> None:
-    """Four small panels as SVG: microseconds an update, or an event, against each quantity."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    # Text stays text, and the same figures give the same file.
-    matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "streamfeat"})
-    figure = Figure(figsize=(10, 2.8), layout="constrained")
-    panels = figure.subplots(1, 4)
-    series = {
-        "K": {
-            "direct": figures["K"]["ns"],
-            "inverse": figures["inverse"]["inverse"],
-            "from scratch": figures["K"]["from_scratch_ns"],
-        }
-    } | {
-        name: {"direct": figures[name]["ns"], "from scratch": figures[name]["from_scratch_ns"]}
-        for name in ("patch", "bins", "stride")
-    }
-    colours = {"direct": "tab:blue", "inverse": "tab:orange", "from scratch": "tab:grey"}
-    for axes, (name, lines) in zip(panels, series.items(), strict=True):
-        for label, points in lines.items():
-            if not points:
-                continue
-            x = [int(value) for value in points]
-            factor = [figures[name]["updates_per_event"][v] if name == "stride" else 1.0 for v in points]
-            middle, low, high = (
-                [point[p] * f / 1e3 for point, f in zip(points.values(), factor, strict=True)]
-                for p in ("p50", "p10", "p90")
-            )
-            axes.plot(x, middle, marker="o", markersize=3, label=label, color=colours[label])
-            axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=colours[label])
-        axes.set_yscale("log")
-        axes.set_xlabel(
-            {"K": "filters K", "patch": "patch, pixels", "bins": "bins", "stride": "stride, pixels"}[name]
-        )
-        axes.set_title("us an event" if name == "stride" else "us an event and volume", fontsize=9)
-        axes.grid(alpha=0.3)
-    panels[0].set_xscale("log")
-    panels[0].legend(fontsize=7)
-    figure.savefig(target, format="svg", metadata={"Date": None})

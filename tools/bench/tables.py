@@ -258,15 +258,13 @@ def _growth(part: dict[str, Any]) -> str:
                 f"{width}x{height}",
                 f"{row['rate'] / 1e6:g}",
                 f"{row['ns']['p50']:,.0f}",
-                f"{row['predicted_ns']:,.0f}{' (fit)' if row['fitted'] else ''}",
                 *("" if tail is None else _short(tail) for tail in tails),
             )
         )
     return (
-        "**Growth**: nanoseconds of the processor an event, measured, and predicted from what the kernels "
-        "have to do and two constants of the machine, which are fitted to the rows marked so; "
-        "then the latency of an event, or of an emission, in microseconds.\n\n"
-        + _table(("emit", "K", "stride", "cameras", "sensor", "Mev/s", "ns", "predicted", "p50", "p99"), rows)
+        "**Growth**: nanoseconds of the processor an event, and the latency of an event, or of an emission, "
+        "in microseconds.\n\n"
+        + _table(("emit", "K", "stride", "cameras", "sensor", "Mev/s", "ns", "p50", "p99"), rows)
         + "\n\n![Cost of an event against K, stride, resolution, rate and cameras](growth.svg)"
     )
 

@@ -21,7 +21,7 @@ import numpy as np
 import zenoh
 
 from streamfeat.events import Events
-from streamfeat.messages.cdr import FeaturesMessage
+from streamfeat.messages.cdr import EventPacket, FeaturesMessage
 from streamfeat.recordings.reader import open_recording
 
 FRAME = (100, 120)
@@ -47,6 +47,22 @@ def camera_packets(recording: Path, seconds: float, slice_us: int = 2_000) -> li
             if total > seconds * 1e6:
                 break
     return slices
+
+
+def numbered(ready: EventPacket, n: int, stamp_ns: int) -> bytes:
+    """An encoded packet as the `n`th of a camera at another time, as CDR."""
+    return EventPacket(stamp_ns, "", *FRAME, n, stamp_ns, ready.encoding, False, ready.events).to_cdr()
+
+
+def paced(per_s: float, seconds: float) -> Iterator[int]:
+    """Count up at a rate of the clock, for some seconds; what is late follows at once."""
+    started, n = time.perf_counter(), 0
+    while (passed := time.perf_counter() - started) < seconds:
+        if n >= passed * per_s:
+            time.sleep(0.0005)
+            continue
+        yield n
+        n += 1
 
 
 class Reader:

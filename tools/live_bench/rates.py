@@ -22,6 +22,8 @@ from tools.live_bench.processes import (
     counts,
     finish,
     listener,
+    numbered,
+    paced,
     wait_for_reader,
 )
 
@@ -59,23 +61,15 @@ def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "aut
         wait_for_reader(session, KEY)
         ready = ready_packets(arguments.recording, step_us)
         started, n = time.perf_counter(), 0
-        while (now := time.perf_counter()) - started < seconds:
-            due = int((now - started) * rate / size)
-            if n >= due:
-                time.sleep(0.0005)
-                continue
-            message = ready[n % len(ready)]
-            stamp = n * step_us * 1000
-            fresh = EventPacket(stamp, "", *FRAME, n, stamp, message.encoding, False, message.events)
-            camera.put(fresh.to_cdr())
-            n += 1
+        for n in paced(rate / size, seconds):
+            camera.put(numbered(ready[n % len(ready)], n, n * step_us * 1000))
+        n += 1
         sent_s = time.perf_counter() - started
         # One more that waits for its turn: of what is lost at the very end nothing else would tell.
         attached = Attachment(n + 1, time.time_ns(), camera.gid).pack()
         blocking = zenoh.CongestionControl.BLOCK
-        stamp = n * step_us * 1000
-        last = EventPacket(stamp, "", *FRAME, n, stamp, message.encoding, False, message.events)
-        session.put(KEY, last.to_cdr(), congestion_control=blocking, attachment=attached)
+        last = numbered(ready[n % len(ready)], n, n * step_us * 1000)
+        session.put(KEY, last, congestion_control=blocking, attachment=attached)
         n += 1
         stopped = time.perf_counter()
         wait = time.monotonic() + 30
@@ -95,7 +89,7 @@ def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "aut
         "lost": result["lost"],
         "dropped": result["dropped"],
         "unaccounted": n - sum(result[name] for name in ("packets", "lost", "dropped", "unheard")),
-        "readings": result["emissions"],
+        "emissions": result["emissions"],
         "incomplete": result["incomplete"],
         "last_features_after_s": round(behind_s, 3),
         "end_to_end_p50_ms": result.get("end_to_end_p50_ms"),

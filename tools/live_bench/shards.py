@@ -10,7 +10,16 @@ from streamfeat.live.publisher import MessagePublisher
 from streamfeat.live.shard import Shard
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.report.machine import Disturbance
-from tools.live_bench.processes import FRAME, KEY, counts, cpu_seconds, finish, listener, wait_for_reader
+from tools.live_bench.processes import (
+    KEY,
+    counts,
+    cpu_seconds,
+    finish,
+    listener,
+    numbered,
+    paced,
+    wait_for_reader,
+)
 from tools.live_bench.rates import PACKET, ready_packets
 
 _RATE = 150
@@ -42,16 +51,10 @@ def _listening(arguments: Namespace, shard: str) -> dict[str, Any]:
         idle_s = cpu_seconds(one.pid)
         time.sleep(arguments.seconds)
         idle_s = cpu_seconds(one.pid) - idle_s
-        before_s, started, n = cpu_seconds(one.pid), time.perf_counter(), 0
-        while (passed := time.perf_counter() - started) < arguments.seconds:
-            if n >= passed * _RATE:
-                time.sleep(0.001)
-                continue
-            stamp = n * step_us * 1000
-            message = ready[n % len(ready)]
-            fresh = EventPacket(stamp, "", *FRAME, n, stamp, message.encoding, False, message.events)
-            camera.put(fresh.to_cdr())
-            n += 1
+        before_s, n = cpu_seconds(one.pid), 0
+        for n in paced(_RATE, arguments.seconds):
+            camera.put(numbered(ready[n % len(ready)], n, n * step_us * 1000))
+        n += 1
         while sum(counts(metrics).get(name, 0) for name in ("packets", "other_shards_packets")) < n - 1:
             time.sleep(0.1)
         taken_s = cpu_seconds(one.pid) - before_s

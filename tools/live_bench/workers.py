@@ -30,7 +30,7 @@ from streamfeat.messages.cdr import EventPacket, FeaturesMessage
 from streamfeat.messages.packets import PacketWriter
 from streamfeat.report.machine import Disturbance
 from tools.live_bench.faults import ROUTER
-from tools.live_bench.processes import FRAME, PROGRAM, camera_packets, process, zenoh_config
+from tools.live_bench.processes import FRAME, PROGRAM, camera_packets, numbered, process, zenoh_config
 from tools.live_bench.spaces import HOST, NotHereError, Two, logged, two_workers
 
 _KEYS = [f"bench/{i}/events" for i in range(8)]
@@ -130,9 +130,8 @@ class _Camera:
 
     def put(self, ready: EventPacket) -> None:
         stamp = (1_000_000 + self.sent * _SLICE_US) * 1000
-        message = EventPacket(stamp, "", *FRAME, self.sent, stamp, ready.encoding, False, ready.events)
+        self._publisher.put(numbered(ready, self.sent, stamp))
         self.sent += 1
-        self._publisher.put(message.to_cdr())
 
     def behind_s(self, stamp_ns: int) -> float:
         """How much stream time has been sent since a stamp."""

@@ -1,0 +1,989 @@
+"""Which cases the rows of the kernel table must reach: where no argument does, a row proves nothing.
+
+A case is a name and a condition on one call: the arguments by name, as they were before, and `result`. Where
+a kernel goes step by step, it is a condition on one step, from the state that the steps before have left.
+"""
+
+import inspect
+from types import SimpleNamespace
+
+import naive
+import numpy as np
+
+from streamfeat.kernels.layout import (
+    BEFORE_TIME,
+    CLOCK_DIRTY,
+    CLOCK_NOW,
+    CLOCK_PLANE,
+    CLOCK_START,
+    CLOCK_TOUCHED,
+    CURSOR_CODED,
+    CURSOR_ENTRY,
+    CURSOR_PROJECTED,
+    MOMENT_SQUARES,
+    MOMENT_SUM,
+    SOFT,
+    SPLIT,
+    TRIANGLE,
+)
+
+
+def call_of(row, run):
+    """One call of a row's kernel, its arguments by name."""
+    names = inspect.signature(row.kernel.py_func).parameters
+    return SimpleNamespace(**dict(zip(names, run.before, strict=True)), result=run.result)
+
+
+def reached(row, run):
+    """Names of the cases that one call reaches."""
+    call = call_of(row, run)
+    found = {name for name, holds in CASES.get(row.name, {}).items() if holds(call)}
+    if row.name in STEPS:
+        steps, cases = STEPS[row.name]
+        for step in steps(call):
+            found |= {name for name, holds in cases.items() if name not in found and holds(step)}
+    return found
+
+
+def cases_of(row):
+    """Names of all cases of a row."""
+    _, cases = STEPS.get(row.name, (None, {}))
+    return CASES.get(row.name, {}).keys() | cases.keys()
+
+
+# Packets: what a decoder makes of each word depends on the words before it.
+
+
+def _evt3_steps(call):
+    """Each word, with the state before it."""
+    state, out = call.state.copy(), call.out.copy()
+    for i, word in enumerate(call.words.tolist()):
+        high, _, _, base, _, seen = state.tolist()
+        step = (word % 4096 - high) % 4096
+        yield SimpleNamespace(kind=word >> 12, value=word % 4096, high=high, base=base, seen=seen, step=step)
+        naive.decode_evt3(call.words[i : i + 1], state, out)
+
+
+EVT3 = {
+    "an event before there is a row": lambda s: s.kind == 2 and s.seen < 3,
+    "an event": lambda s: s.kind == 2 and s.seen >= 3,
+    "a row before there is a time": lambda s: s.kind == 0 and s.seen < 2,
+    "a base before there is a row": lambda s: s.kind == 3 and s.seen < 3,
+    "12 pixels without a base": lambda s: s.kind == 4 and s.seen == 3,
+    "8 pixels without a base": lambda s: s.kind == 5 and s.seen == 3,
+    "12 pixels": lambda s: s.kind == 4 and s.seen >= 4 and s.value > 0,
+    "8 pixels": lambda s: s.kind == 5 and s.seen >= 4 and s.value % 256 > 0,
+    "8 pixels and bits beyond them": lambda s: s.kind == 5 and s.seen >= 4 and s.value > 255,
+    "the next column of a vector wraps": lambda s: s.kind in (4, 5) and s.seen >= 4 and s.base > 65535 - 8,
+    "a low time before a high one": lambda s: s.kind == 6 and s.seen < 1,
+    "a word that carries no event": lambda s: s.kind in (7, 10, 14, 15),
+    "time goes on": lambda s: s.kind == 8 and 0 < s.step < 2048,
+    "time goes on by half of a turn": lambda s: s.kind == 8 and s.step == 2048,
+    "time stands": lambda s: s.kind == 8 and s.step == 0,
+    "time goes back a little": lambda s: s.kind == 8 and s.step > 2048 and s.high + s.step >= 4096,
+    "time would go back below zero": lambda s: s.kind == 8 and s.step > 2048 and s.high + s.step < 4096,
+    "time wraps": lambda s: s.kind == 8 and 0 < s.step < 2048 and s.high % 4096 + s.step >= 4096,
+}
+
+
+def _kinds(*kinds):
+    return lambda call: bool(np.isin(call.words >> 12, kinds).any())
+
+
+LIBCAER_CMP = {
+    "a word of an unknown type": lambda call: call.result < 0,
+    "all are known": lambda call: call.result > 0,
+    "no word": lambda call: len(call.words) == 0,
+    "a high time": _kinds(0),
+    "a low time": _kinds(1),
+    "a column": _kinds(2),
+    "an event": _kinds(3),
+    "8 pixels": _kinds(5),
+    "a vector before its base, from the packet before": lambda call: bool(
+        call.state.any() and len(call.words) and call.words[0] >> 12 == 5
+    ),
+    "the next row of a vector wraps": lambda call: (
+        call.state[1] > 65535 - 8 and len(call.words) > 0 and call.words[0] >> 12 == 5
+    ),
+}
+
+MONO = {
+    "no word": lambda call: len(call.words) == 0,
+    "OFF": lambda call: (call.words >> np.uint64(63) == 0).any(),
+    "ON": lambda call: (call.words >> np.uint64(63) == 1).any(),
+    "nanoseconds of the packet carry": lambda call: any(
+        (call.rest_ns + int(word) % 2**32) // 1000 > int(word) % 2**32 // 1000 for word in call.words
+    ),
+    "a row beyond 14 bits": lambda call: (call.words >> np.uint64(62) & np.uint64(1)).any(),
+}
+
+
+def _stream_kinds(call):
+    """The first byte of each item of an Event Stream, as far as they are whole."""
+    at, firsts = 0, []
+    while at < len(call.data):
+        first = int(call.data[at])
+        firsts.append(first)
+        at += 1 if first >= (0xFC if call.is_atis else 0xFE) else 5
+    return firsts, at > len(call.data)
+
+
+EVENT_STREAM = {
+    "no byte": lambda call: len(call.data) == 0,
+    "a long time of a DVS": lambda call: not call.is_atis and 0xFF in _stream_kinds(call)[0],
+    "a reset of a DVS": lambda call: not call.is_atis and 0xFE in _stream_kinds(call)[0],
+    "a long time of an ATIS": lambda call: call.is_atis and 0xFE in _stream_kinds(call)[0],
+    "a threshold crossing": lambda call: (
+        call.is_atis and any(f % 2 and f < 0xFC for f in _stream_kinds(call)[0])
+    ),
+    "an event that is cut": lambda call: _stream_kinds(call)[1],
+    "whole events": lambda call: call.result > 0 and not _stream_kinds(call)[1],
+}
+
+ECF = {
+    "no event": lambda call: len(call.out) == 0,
+    "runs of rows, masks of columns": lambda call: call.data[0] & 3 == 0 and call.result > 0,
+    "runs of rows, columns in groups": lambda call: call.data[0] & 3 == 1 and call.result > 0,
+    "pixels in groups": lambda call: call.data[0] & 2 != 0 and call.result > 0,
+    "damaged or cut": lambda call: call.result < 0,
+    "the second time is a long step": lambda call: call.result > 0 and call.data[13] >> 4 == 15,
+    "the first run of times is long": lambda call: call.result > 0 and call.data[12] % 16 == 15,
+}
+
+GROUPS = {
+    "no event": lambda call: len(call.out) == 0,
+    "12 bits": lambda call: call.bits == 12 and call.result > call.at,
+    "24 bits": lambda call: call.bits == 24 and call.result > call.at,
+    "a group that is not whole": lambda call: len(call.out) % 4 != 0 and call.result > call.at,
+    "cut": lambda call: call.result < 0,
+}
+
+
+def _on_sensor(call):
+    return (call.events["x"] < call.width) & (call.events["y"] < call.height)
+
+
+TIME_SPAN = {
+    "no event": lambda call: len(call.events) == 0,
+    "events, none on the sensor": lambda call: len(call.events) > 0 and not _on_sensor(call).any(),
+    "the first is the latest": lambda call: (
+        _on_sensor(call)[:1].any() and call.events["t"][0] == call.events["t"][_on_sensor(call)].max()
+    ),
+    "the earliest of all is not on the sensor": lambda call: (
+        _on_sensor(call).any() and not _on_sensor(call)[call.events["t"].argmin()]
+    ),
+    "the latest of all is not on the sensor": lambda call: (
+        _on_sensor(call).any() and not _on_sensor(call)[call.events["t"].argmax()]
+    ),
+    "the first column beyond the sensor": lambda call: (call.events["x"] == call.width).any(),
+    "the first row beyond the sensor": lambda call: (call.events["y"] == call.height).any(),
+}
+
+# Noise: each event is one step from the state that the events before it left.
+
+
+def _noise_steps(call):
+    """Each event with the state before it, its pixel's past, and what became of it."""
+    arrays = (call.past.copy(), call.level.copy(), call.removed.copy())
+    for i, event in enumerate(call.events.tolist()):
+        past, level, removed = (array.copy() for array in arrays)
+        keep = np.zeros(1, np.bool_)
+        naive.mark_noise(call.events[i : i + 1], call.limits, *arrays, keep)
+        x, y, p, t = event
+        inside = x < level.shape[1] and y < level.shape[0]
+        yield SimpleNamespace(
+            x=x,
+            y=y,
+            p=p,
+            t=t,
+            inside=inside,
+            valid=inside and p in (0, 1) and abs(t) < 2**62,
+            limits=call.limits.tolist(),
+            past=past,
+            own=past[:, y, x].tolist() if inside else None,
+            level=level,
+            kept=bool(keep[0]),
+            reason=next(iter(np.flatnonzero(arrays[2] - removed).tolist()), None),
+            level_after=int(arrays[1][y, x]) if inside else 0,
+        )
+
+
+def _valid(holds):
+    return lambda step: step.valid and holds(step)
+
+
+NOISE = {
+    "outside the sensor": lambda s: not s.inside,
+    "no polarity": lambda s: s.inside and s.p not in (0, 1),
+    "an impossible time": lambda s: s.inside and abs(s.t) >= 2**62,
+    "the last possible time": lambda s: s.inside and abs(s.t) == 2**62 - 1,
+    "hot": _valid(lambda s: s.reason == 0),
+    "as hot as it can be": _valid(lambda s: s.level_after == 2_000_000),
+    "a level that time has lowered to nothing": _valid(
+        lambda s: s.limits[0] and s.level[s.y, s.x] and s.level_after == s.limits[0]
+    ),
+    "a level that time going back leaves": _valid(
+        lambda s: s.limits[0] and s.t < s.own[0] and s.level_after > s.level[s.y, s.x]
+    ),
+    "refractory": _valid(lambda s: s.reason == 1 and s.t >= s.own[1]),
+    "refractory, and time goes back": _valid(lambda s: s.reason == 1 and s.t < s.own[1]),
+    "exactly one refractory period later": _valid(
+        lambda s: s.limits[1] and s.reason != 0 and s.t - s.own[1] == s.limits[1]
+    ),
+    "isolated": _valid(lambda s: s.reason == 2),
+    "isolated, and only its own pixel is recent": _valid(
+        lambda s: s.reason == 2 and abs(s.t - s.own[2]) <= s.limits[2]
+    ),
+    "supported": _valid(lambda s: s.limits[2] and s.kept),
+    "supported, at a corner of the sensor": _valid(
+        lambda s: s.limits[2] and s.kept and s.y == s.x == 0 and s.level.size > 1
+    ),
+    "nothing is asked for": _valid(lambda s: not any(s.limits)),
+    "all three are": _valid(lambda s: all(s.limits)),
+}
+
+# Events to counts.
+
+
+def _leap(call):
+    return call.new - int(call.state.clock[CLOCK_NOW])
+
+
+def _bins(call):
+    return len(call.state.counts)
+
+
+ADVANCE = {
+    "to a bin before": lambda call: _leap(call) < 0,
+    "to the same bin": lambda call: _leap(call) == 0,
+    "to the next bin, one plane": lambda call: _leap(call) == 1 and len(call.state.cursors) == 1,
+    "to the next bin, and the planes swap": lambda call: _leap(call) == 1 and len(call.state.cursors) == 2,
+    "further, two planes": lambda call: _leap(call) > 1 and len(call.state.cursors) == 2,
+    "within the window": lambda call: 1 < _leap(call) < _bins(call),
+    "by exactly one window": lambda call: 1 < _leap(call) == _bins(call),
+    "beyond the window": lambda call: _bins(call) < _leap(call) < 2**40,
+    "from before time": lambda call: call.state.clock[CLOCK_NOW] == BEFORE_TIME,
+}
+
+
+def _place(call):
+    """Where an event lies: the bin it is in, from the current one, if it is valid."""
+    height, width = len(call.state.ring_rows), len(call.state.ring_columns)
+    now, start = (int(call.state.clock[slot]) for slot in (CLOCK_NOW, CLOCK_START))
+    valid = call.x < width and call.y < height and call.p in (0, 1) and abs(call.t) < 2**62
+    if not valid or now == BEFORE_TIME:
+        return None
+    return (call.t - start) // call.operator.bin_us
+
+
+def _count_before(call):
+    """The count that an event falls on, where its bin is in the window."""
+    place = _place(call)
+    if place is None or not -_bins(call) < place <= 0:
+        return None
+    side = call.operator.downsample
+    slot = naive.slot_of(_bins(call) - 1 + place, call.state)
+    return int(call.state.counts[slot, call.y // side, call.x // side])
+
+
+def _one(holds):
+    return lambda call: (place := _place(call)) is not None and holds(place, _bins(call))
+
+
+def _on_count(holds):
+    return lambda call: (
+        (count := _count_before(call)) is not None and holds(count, call.operator.max_count, 2 * call.p - 1)
+    )
+
+
+COUNT_EVENT = {
+    "outside, by its column": lambda call: call.x >= len(call.state.ring_columns),
+    "outside, by its row": lambda call: call.y >= len(call.state.ring_rows),
+    "a polarity below": lambda call: call.p < 0,
+    "a polarity above": lambda call: call.p > 1,
+    "a time too early": lambda call: call.t <= -(2**62),
+    "a time too late": lambda call: call.t >= 2**62,
+    "in the current bin": _one(lambda place, bins: place == 0),
+    "in a bin before it": _one(lambda place, bins: -bins < place < 0),
+    "in the oldest bin": _one(lambda place, bins: place == 1 - bins < 0),
+    "just older than the window": _one(lambda place, bins: place == -bins),
+    "far too late": _one(lambda place, bins: place < -bins - 1),
+    "in the next bin": _one(lambda place, bins: place == 1),
+    "in a bin far ahead": _one(lambda place, bins: place > bins),
+    "saturated, ON": _on_count(lambda count, limit, step: count >= limit and step > 0),
+    "saturated, OFF": _on_count(lambda count, limit, step: count <= -limit and step < 0),
+    "back from beyond the limit": _on_count(
+        lambda count, limit, step: abs(count) > limit and count * step < 0
+    ),
+    "back from the limit": _on_count(lambda count, limit, step: count == -step * limit),
+}
+
+START_OF_BIN = {
+    "before time": lambda call: call.state.clock[CLOCK_NOW] == BEFORE_TIME,
+    "in time": lambda call: call.state.clock[CLOCK_NOW] != BEFORE_TIME,
+}
+SLOT_OF = {
+    "wraps": lambda call: call.result < call.position,
+    "does not": lambda call: call.result >= call.position,
+    "the current bin": lambda call: call.position == _bins(call) - 1,
+}
+
+
+def _count_steps(call):
+    """Each event of a batch as a call of its own."""
+    state = type(call.state)(*(field.copy() for field in call.state))
+    for i, (x, y, p, t) in enumerate(call.events.tolist()):
+        yield SimpleNamespace(x=x, y=y, p=p, t=t, operator=call.operator, state=state)
+        naive.count_events(call.events[i : i + 1], call.operator, state)
+
+
+def _is_touched(step):
+    side = step.operator.downsample
+    slot = naive.slot_of(_bins(step) - 1 + _place(step), step.state)
+    return bool(step.state.is_touched[slot, step.y // side, step.x // side])
+
+
+def _unchanged(step):
+    count = _count_before(step)
+    if count is None:
+        return False
+    limit, step_by = step.operator.max_count, 2 * step.p - 1
+    return np.clip(count, -limit, limit) == np.clip(count + step_by, -limit, limit)
+
+
+COUNT_EVENTS = COUNT_EVENT | {
+    "touched in the current bin": lambda s: _place(s) == 0 and not _unchanged(s) and not _is_touched(s),
+    "touched again in the current bin": lambda s: _place(s) == 0 and not _unchanged(s) and _is_touched(s),
+    "touched before, and saturated now": lambda s: _unchanged(s) and _is_touched(s),
+    "touched again in a bin before": lambda s: (
+        _count_before(s) is not None and _place(s) < 0 and not _unchanged(s) and _is_touched(s)
+    ),
+}
+
+# Codes.
+
+
+def _soft(call):
+    z = naive._scores(call.projection, call.sigma, call.operator)[: call.operator.n_filters]
+    return z, call.operator.threshold
+
+
+SOFT_CODE = {
+    "above the threshold": lambda call: (_soft(call)[0] > _soft(call)[1]).any(),
+    "below minus the threshold": lambda call: (_soft(call)[0] < -_soft(call)[1]).any(),
+    "between them": lambda call: (np.abs(_soft(call)[0]) < _soft(call)[1]).any(),
+    "padding": lambda call: call.operator.n_filters < len(call.code),
+}
+
+
+def _triangle(call):
+    code = call.code.copy()
+    naive.triangle_code(call.projection, call.sigma, call.square, call.operator, code)
+    return code[: call.operator.n_filters]
+
+
+TRIANGLE_CODE = {
+    "nearer than the mean": lambda call: (_triangle(call) > 0).any(),
+    "farther than the mean": lambda call: (_triangle(call) == 0).any() and len(_triangle(call)) > 1,
+    "a single filter": lambda call: call.operator.n_filters == 1,
+    "padding": lambda call: call.operator.n_filters < len(call.code),
+}
+MEAN_DISTANCE = {
+    "rounded": lambda call: call.distances[: call.n_filters].sum(dtype=np.int64) % call.n_filters > 0,
+    "a sum beyond 32 bits": lambda call: call.distances[: call.n_filters].sum(dtype=np.int64) > 2**31,
+    "not all filters": lambda call: call.n_filters < len(call.distances),
+}
+
+
+def _square(call):
+    return call.length - 2 * call.z / call.unit + call.square_norm
+
+
+FIXED_DISTANCE = {
+    "a square below zero": lambda call: _square(call) < -1e-3,
+    "a square above zero": lambda call: _square(call) > 1e-3,
+}
+DEVIATION = {
+    "a mean of zero": lambda call: call.moments[MOMENT_SUM] == 0,
+    "a mean that is not zero": lambda call: call.moments[MOMENT_SUM] != 0,
+    "all entries alike": lambda call: (
+        call.moments[MOMENT_SUM] ** 2 == call.entries * call.moments[MOMENT_SQUARES]
+    ),
+}
+WHITENED_SQUARE = {
+    "below zero": lambda call: call.result == 0,
+    "inside": lambda call: 0 < call.result < call.operator.reach**2,
+    "beyond reach": lambda call: call.result == call.operator.reach**2,
+}
+POOL = {
+    f"{sign_name}, {kind_name}": lambda call, sign=sign, is_split=is_split: (
+        call.sign == sign and (call.kind == SPLIT) == is_split and call.code.min() < 0 < call.code.max()
+    )
+    for sign_name, sign in (("added", 1), ("taken", -1))
+    for kind_name, is_split in (("split", True), ("not split", False))
+}
+
+# The lasso.
+
+
+def _subset(call):
+    """How the chosen atoms lie among all."""
+    return len(call.chosen), len(call.gram)
+
+
+LASSO = {
+    "duality_gap": {
+        "the residual is feasible": lambda call: np.abs(call.residual).max() <= call.penalty,
+        "it has to be shrunk": lambda call: np.abs(call.residual).max() > call.penalty,
+        "no atom in use": lambda call: not call.atoms.any(),
+        "a square that rounding has made too small": lambda call: (
+            call.square - call.right @ call.atoms - call.residual @ call.atoms < 0
+        ),
+    },
+    "select_atoms": {
+        "in use, though its correlation is small": lambda call: (
+            (call.atoms != 0) & (np.abs(call.right - call.response) <= call.least)
+        ).any(),
+        "not in use, and its correlation is large": lambda call: (
+            (call.atoms == 0) & (np.abs(call.right - call.response) > call.least)
+        ).any(),
+        "left out": lambda call: call.result < len(call.right),
+        "none": lambda call: call.result == 0,
+        "all": lambda call: call.result == len(call.right),
+    },
+    "copy_corner": {
+        "no atom": lambda call: _subset(call)[0] == 0,
+        "some atoms": lambda call: 0 < _subset(call)[0] < _subset(call)[1],
+        "all atoms": lambda call: _subset(call)[0] == _subset(call)[1],
+        "atoms with others between": lambda call: bool((np.diff(call.chosen) > 1).any()),
+    },
+    "descend": {
+        "an atom of length zero": lambda call: (np.diag(call.corner) == 0).any(),
+        "an atom leaves": lambda call: ((call.atoms != 0) & (_descended(call) == 0)).any(),
+        "an atom enters": lambda call: ((call.atoms == 0) & (_descended(call) != 0)).any(),
+        "an atom changes its sign": lambda call: (call.atoms * _descended(call) < 0).any(),
+        "an atom stays at zero": lambda call: ((call.atoms == 0) & (_descended(call) == 0)).any(),
+    },
+    "add_rows": {
+        "no row": lambda call: len(call.moved) == 0,
+        "fewer than four": lambda call: 0 < len(call.moved) < 4,
+        "fours alone": lambda call: len(call.moved) > 0 and len(call.moved) % 4 == 0,
+        "fours and a rest": lambda call: len(call.moved) > 4 and len(call.moved) % 4 > 0,
+    },
+    "respond": {
+        "no atom in use": lambda call: not call.kept[0].any(),
+        "some in use": lambda call: call.kept[0].any() and not call.kept[0].all(),
+    },
+    "solve_lasso": {
+        "the solution is zero": lambda call: np.abs(call.right).max() <= call.penalty,
+        "it is not": lambda call: np.abs(call.right).max() > call.penalty,
+        "it starts from the solution": lambda call: _gap_of(call, call.kept[0]) <= call.gap,
+        "it starts from zero": lambda call: not call.kept[0].any(),
+        "it starts from another code": lambda call: call.kept[0].any() and _gap_of(call, call.kept[0]) > 0.1,
+    },
+    "solve_lasso_rows": {
+        "one row": lambda call: len(call.right) == 1,
+        "several rows": lambda call: len(call.right) > 1,
+    },
+    "lasso_code": {
+        "one atom": lambda call: call.operator.n_filters == 1,
+        "padding": lambda call: call.operator.n_filters < len(call.projection),
+        "no padding": lambda call: call.operator.n_filters == len(call.projection),
+    },
+    "fix_atoms": {
+        "within the bound": lambda call: (np.abs(call.atoms) < _bound(call.operator)).all(),
+        "clipped from above": lambda call: (call.atoms > _bound(call.operator)).any(),
+        "clipped from below": lambda call: (call.atoms < -_bound(call.operator)).any(),
+        "padding": lambda call: len(call.atoms) < len(call.code),
+    },
+}
+
+
+def _descended(call):
+    atoms = call.atoms.copy()
+    naive.descend(call.penalty, call.corner, atoms, call.residual.copy())
+    return atoms
+
+
+def _gap_of(call, atoms):
+    residual = call.right - call.gram.astype(np.float64) @ atoms
+    return naive.duality_gap(residual, call.right, atoms, call.square, call.penalty) / (call.square / 2)
+
+
+def _bound(operator):
+    """No atom of a solution exceeds it."""
+    return operator.reach**2 / (2 * operator.threshold / operator.unit)
+
+
+# Volumes and planes.
+
+
+def _is_of(operator, kind):
+    return not operator.inverse and operator.kind == kind
+
+
+ENCODE_VOLUME = {
+    "empty, and its lasso code is forgotten": lambda call: (
+        call.moments[MOMENT_SQUARES] == 0 and call.fresh and call.atoms.any()
+    ),
+    "empty, and taken away": lambda call: call.moments[MOMENT_SQUARES] == 0 and not call.fresh,
+    "a lasso code shown again": lambda call: (
+        call.operator.inverse and call.moments[MOMENT_SQUARES] > 0 and not call.fresh
+    ),
+} | {
+    name: lambda call, kind=kind: call.moments[MOMENT_SQUARES] > 0 and _is_of(call.operator, kind)
+    for name, kind in (("soft", SOFT), ("split", SPLIT), ("triangle", TRIANGLE))
+}
+
+READ_FEATURES = {
+    "split": lambda call: call.operator.kind == SPLIT,
+    "not split": lambda call: call.operator.kind != SPLIT,
+    "padding": lambda call: call.operator.n_filters < len(call.operator.offset),
+    "one cell": lambda call: call.state.pooled.shape[1] == 1,
+    "many cells": lambda call: call.state.pooled.shape[1] > 4,
+    "the other plane is current": lambda call: call.state.clock[CLOCK_PLANE] == 1,
+}
+
+
+def _news(call):
+    """`(plane, volume, entry)` for each touched entry that changed and each volume that covers it.
+
+    Volumes are compared with every place by brute force; `entry` is None where a plane has lost the bin.
+    """
+    state, operator = call.state, call.operator
+    rows, columns = getattr(call, "shape", None) or operator.shape
+    n_bins, limit, patch = _bins(call), operator.max_count, operator.patch
+    for flat in state.touched[: state.clock[CLOCK_TOUCHED]]:
+        slot, row, column = np.unravel_index(int(flat), state.counts.shape)
+        if np.clip(state.counts[slot, row, column], -limit, limit) == state.applied[slot, row, column]:
+            continue
+        position = next(i for i in range(n_bins) if naive.slot_of(i, state) == slot)
+        for plane in range(len(state.cursors)):
+            there = position - int(plane != state.clock[CLOCK_PLANE])
+            for volume in range(rows * columns):
+                top, left = (index * operator.stride for index in divmod(volume, columns))
+                if top <= row < top + patch and left <= column < left + patch:
+                    entry = (there * patch + row - top) * patch + column - left
+                    yield plane, volume, int(entry) if there >= 0 else None
+
+
+def _news_of_volumes(call):
+    """Entries that changed, by `(plane, volume)`, with the cursors of the plane."""
+    found = {}
+    for plane, volume, entry in _news(call):
+        if entry is not None:
+            found.setdefault((plane, volume), []).append(entry)
+    for (plane, volume), entries in found.items():
+        cursors = call.state.cursors[plane]
+        yield plane, volume, entries, int(cursors[CURSOR_PROJECTED]), int(cursors[CURSOR_ENTRY])
+
+
+def _any_news(holds):
+    return lambda call: any(holds(*news) for news in _news_of_volumes(call))
+
+
+def _came_back(call):
+    state, limit = call.state, call.operator.max_count
+    places = state.touched[: state.clock[CLOCK_TOUCHED]]
+    clipped = state.counts.reshape(-1)[places].clip(-limit, limit)
+    return (clipped == state.applied.reshape(-1)[places]).any()
+
+
+def _n_changed(call):
+    limit = call.operator.max_count
+    return int((call.state.counts.clip(-limit, limit) != call.state.applied).sum())
+
+
+MARK_DIRTY = {
+    "nothing changed": lambda call: _n_changed(call) == 0,
+    "an entry that came back": _came_back,
+    "an entry that no volume covers": lambda call: _n_changed(call) > 0 and not list(_news(call)),
+    "a bin that the plane ahead has lost": lambda call: any(entry is None for *_, entry in _news(call)),
+    "a volume with its whole projection": _any_news(lambda plane, volume, entries, last, end: volume < last),
+    "a volume without projection": _any_news(lambda plane, volume, entries, last, end: volume > last),
+    "the partly projected volume, inside its part": _any_news(
+        lambda plane, volume, entries, last, end: volume == last and 0 < max(entries) < end
+    ),
+    "the partly projected volume, beyond its part": _any_news(
+        lambda plane, volume, entries, last, end: volume == last and 0 < end <= min(entries)
+    ),
+    "the partly projected volume, on both sides": _any_news(
+        lambda plane, volume, entries, last, end: volume == last and min(entries) < end <= max(entries)
+    ),
+    "several entries of one volume": _any_news(lambda plane, volume, entries, last, end: len(entries) > 1),
+    "both planes": lambda call: len({plane for plane, *_ in _news_of_volumes(call)}) == 2,
+    "a plane with projections and no codes": lambda call: any(
+        call.state.cursors[plane, CURSOR_CODED] <= volume < last
+        for plane, volume, _, last, _ in _news_of_volumes(call)
+    ),
+}
+
+# Volumes that enter planes, and planes that are filled.
+
+
+def _n_volumes(state):
+    return len(state.cells)
+
+
+def _shares_rows(call):
+    return call.state.projections.shape[1] == 1
+
+
+def _row_of(call):
+    """The moments of a call's volume."""
+    row = getattr(call, "row", call.volume)
+    return call.state.moments[call.plane, min(int(row), call.state.projections.shape[1] - 1)]
+
+
+def _is_empty(call):
+    return _row_of(call)[MOMENT_SQUARES] == 0
+
+
+def _has_form(call):
+    return call.operator.quadratic.size > 0
+
+
+def _is_ahead(call):
+    return call.plane != call.state.clock[CLOCK_PLANE]
+
+
+def _cursors(call):
+    return call.state.cursors[call.plane].tolist()
+
+
+def _current(call):
+    return call.state.cursors[call.state.clock[CLOCK_PLANE]].tolist()
+
+
+def _coming(call):
+    return call.state.cursors[1 - call.state.clock[CLOCK_PLANE]].tolist()
+
+
+def _has_two(call):
+    return len(call.state.cursors) == 2
+
+
+FORMS = {"with a quadratic form": _has_form, "without one": lambda call: not _has_form(call)}
+ENCODINGS = {
+    name: lambda call, kind=kind: call.operator.kind == kind and not call.operator.inverse
+    for name, kind in (("soft", SOFT), ("split", SPLIT), ("triangle", TRIANGLE))
+}
+
+POOL_VOLUME = ENCODINGS | {
+    "added": lambda call: call.sign > 0 and not _is_empty(call),
+    "taken": lambda call: call.sign < 0 and not _is_empty(call),
+    "empty": _is_empty,
+    "of the plane ahead": _is_ahead,
+}
+ENTER_CODE = ENCODINGS | {
+    "empty": lambda call: not call.result,
+    "not empty": lambda call: call.result,
+    "volumes share a row": _shares_rows,
+    "of the plane ahead": _is_ahead,
+}
+PROJECT_VOLUME = FORMS | {
+    "from the first entry, over what the row held": lambda call: call.start == 0 and not _is_empty(call),
+    "from the middle": lambda call: call.start > 0,
+    "ends at the most that was asked": lambda call: (
+        call.result[0] == call.most and call.result[1] < (_bins(call) - call.ahead) * call.operator.patch**2
+    ),
+    "ends with the volume": lambda call: (
+        call.result[1] == (_bins(call) - call.ahead) * call.operator.patch**2
+    ),
+    "nothing to let in": lambda call: call.result[0] == 0,
+    "ahead": lambda call: call.ahead == 1,
+    "volumes share a row": _shares_rows,
+}
+COMPLETE = {
+    "the upper part": lambda call: call.part == 0,
+    "the lower part": lambda call: call.part == 1,
+    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
+    "everything is missing": lambda call: _current(call)[CURSOR_PROJECTED] == 0,
+    "a volume that is projected and has no code": lambda call: (
+        _current(call)[CURSOR_CODED] < _current(call)[CURSOR_PROJECTED]
+    ),
+    "a volume that is projected in part": lambda call: _current(call)[CURSOR_ENTRY] > 0,
+    "volumes share a row": _shares_rows,
+}
+LIST_MISSING = {
+    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
+    "everything is missing": lambda call: _current(call)[CURSOR_CODED] == 0,
+    "from within a row of the grid": lambda call: _current(call)[CURSOR_CODED] % call.operator.shape[1] > 0,
+    "volumes share a row": _shares_rows,
+    "an empty volume is left out": lambda call: (
+        call.state.clock[CLOCK_NOW] > BEFORE_TIME and not call.state.applied.any(axis=0).all()
+    ),
+    "the lasso": lambda call: call.operator.inverse,
+}
+LOOK_AHEAD = {
+    "one plane": lambda call: not _has_two(call),
+    "the current plane is not complete": lambda call: (
+        _has_two(call) and _current(call)[CURSOR_CODED] < _n_volumes(call.state)
+    ),
+    "no budget": lambda call: call.budget <= 0,
+    "the budget is spent": lambda call: call.budget > 0 >= call.result,
+    "the goals are reached": lambda call: call.result > 0 and _has_two(call),
+    "goes on in the middle of a volume": lambda call: (
+        _has_two(call) and call.budget > 0 and _coming(call)[CURSOR_ENTRY] > 0
+    ),
+    "more codes than projections are asked for": lambda call: _has_two(call) and call.coded > call.projected,
+    "all are projected already": lambda call: (
+        _has_two(call) and _coming(call)[CURSOR_PROJECTED] == _n_volumes(call.state)
+    ),
+}
+
+# One entry that changes, and volumes that changed.
+
+
+def _after(call):
+    return np.clip(
+        call.state.counts[naive.slot_of(call.position, call.state), call.row, call.column],
+        -call.operator.max_count,
+        call.operator.max_count,
+    )
+
+
+def _covering(call):
+    """Volumes over the entry of a call, and the entry of each in the plane that looks ahead."""
+    state, operator = call.state, call.operator
+    columns = (getattr(call, "shape", None) or operator.shape)[1]
+    patch, stride = operator.patch, operator.stride
+    for volume in range(len(state.cells)):
+        row, column = call.row - volume // columns * stride, call.column - volume % columns * stride
+        if 0 <= row < patch and 0 <= column < patch:
+            yield volume, ((call.position - 1) * patch + row) * patch + column
+
+
+def _partly_ahead(holds):
+    """Whether it holds of an entry in the volume that is projected in part ahead, and of where that ends."""
+    return lambda call: (
+        _has_two(call)
+        and any(
+            volume == _coming(call)[CURSOR_PROJECTED]
+            and call.position > 0
+            and holds(entry, _coming(call)[CURSOR_ENTRY])
+            for volume, entry in _covering(call)
+        )
+    )
+
+
+CHANGE_PLACE = FORMS | {
+    "no volume covers it": lambda call: not list(_covering(call)),
+    "several volumes cover it": lambda call: len(list(_covering(call))) > 1,
+    "in the oldest bin, which the plane ahead has lost": lambda call: _has_two(call) and call.position == 0,
+    "inside what is projected ahead of a volume": _partly_ahead(lambda entry, end: entry < end),
+    "beyond what is projected ahead of a volume": _partly_ahead(lambda entry, end: 0 < end <= entry),
+    "a count becomes zero": lambda call: _after(call) == 0,
+    "a count becomes the largest": lambda call: abs(_after(call)) == call.operator.max_count,
+}
+CHANGE_VOLUME = FORMS | {
+    "with a code": lambda call: call.volume < _cursors(call)[CURSOR_CODED],
+    "empty before": _is_empty,
+    "not empty before": lambda call: not _is_empty(call),
+    "of the plane ahead": _is_ahead,
+}
+FOLLOW_CHANGES = CHANGE_VOLUME | {"several entries": lambda call: call.n > 1}
+MOVE_VOLUME = ENCODINGS | {"of the plane ahead": _is_ahead}
+POOL_SOFT = {
+    f"{name}, {kind_name}": lambda call, sign=sign, kind=kind: call.sign == sign and call.kind == kind
+    for name, sign in (("added", 1), ("taken", -1))
+    for kind_name, kind in (("soft", SOFT), ("split", SPLIT))
+}
+MOVE_CODE = {
+    f"{name}, {kind_name}": lambda call, sign=sign, kind=kind: call.change == sign and call.kind == kind
+    for name, sign in (("up", 1), ("down", -1))
+    for kind_name, kind in (("soft", SOFT), ("split", SPLIT))
+}
+
+
+def _dirty(holds):
+    """Whether it holds of a dirty volume: `(volume, is ahead, cursors of its plane)`."""
+
+    def any_holds(call):
+        n, state = _n_volumes(call.state), call.state
+        found = [divmod(int(index), n) for index in state.dirty[: state.clock[CLOCK_DIRTY]]]
+        return any(
+            holds(volume, plane != state.clock[CLOCK_PLANE], state.cursors[plane].tolist())
+            for plane, volume in found
+        )
+
+    return any_holds
+
+
+RENEW = FORMS | {
+    "nothing is dirty": lambda call: call.state.clock[CLOCK_DIRTY] == 0,
+    "a volume with a code": _dirty(lambda volume, ahead, cursors: volume < cursors[CURSOR_CODED]),
+    "a volume without a code": _dirty(
+        lambda volume, ahead, cursors: cursors[CURSOR_CODED] <= volume < cursors[CURSOR_PROJECTED]
+    ),
+    "a volume that is projected in part": _dirty(
+        lambda volume, ahead, cursors: volume == cursors[CURSOR_PROJECTED]
+    ),
+    "a volume of the plane ahead": _dirty(lambda volume, ahead, cursors: ahead),
+    "the upper part": lambda call: call.part == 0,
+    "the lower part": lambda call: call.part == 1,
+}
+FOLLOW_EVENT = {
+    name: COUNT_EVENT[name]
+    for name in (
+        "outside, by its column",
+        "a polarity above",
+        "in the current bin",
+        "in the next bin",
+        "far too late",
+    )
+} | {
+    "one plane": lambda call: not _has_two(call),
+    "two planes": _has_two,
+}
+
+# Lists of entries.
+
+
+def _line(call):
+    return call.patch**2
+
+
+GATHER_VOLUME = {
+    "the ring wraps": lambda call: call.first_slot > 0,
+    "the ring does not": lambda call: call.first_slot == 0,
+    "all entries": lambda call: call.end == len(call.values),
+    "none": lambda call: call.end == 0,
+    "an end within a bin": lambda call: call.end % _line(call) > 0,
+    "lines that are copied entry by entry": lambda call: call.patch < 8 and call.start < call.end,
+    "lines of vectors that overlap": lambda call: call.patch > 8 and call.start < call.end,
+    "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
+}
+LIST_ENTRIES = {
+    "none": lambda call: call.result == 0,
+    "several vectors": lambda call: call.result > 0 and call.end - call.start > 128,
+    "one that begins and ends within a vector": lambda call: (
+        call.result > 0 and call.start // 64 == (call.end - 1) // 64 and call.start % 64 > 0
+    ),
+    "one just before, that is not listed": lambda call: (
+        call.start % 64 > 0 and call.values[call.start - 1] != 0
+    ),
+    "one just behind": lambda call: call.end % 64 > 0 and call.values[call.end] != 0,
+}
+SUM_COLUMNS = {
+    "none": lambda call: call.n == 0,
+    "an odd number": lambda call: call.n % 2 == 1,
+    "an even one": lambda call: call.n > 0 and call.n % 2 == 0,
+    "one block": lambda call: len(call.sums) <= 96,
+    "blocks of several widths": lambda call: len(call.sums) > 96 and len(call.sums) % 96 > 0,
+}
+TOUCHED_BINS = {
+    "none": lambda call: call.result[0] >= call.result[1],
+    "the oldest bin": lambda call: call.result[0] == 0,
+    "the current bin": lambda call: call.result[1] == len(call.state.counts),
+    "some in the middle alone": lambda call: 0 < call.result[0] < call.result[1] < len(call.state.counts),
+}
+
+# Time surfaces.
+
+
+def _neighbours(call, radius, holds):
+    """Whether it holds for an event and one place around it: `(x, y, dx, dy)`."""
+    offsets = range(-radius, radius + 1)
+    events = set(zip(call.x.tolist(), call.y.tolist(), strict=True))
+    return any(holds(x, y, dx, dy) for x, y in events for dy in offsets for dx in offsets)
+
+
+def _around(holds):
+    return lambda call: _neighbours(
+        call, call.sums.shape[3] // 2, lambda x, y, dx, dy: holds(call, x, y, x + dx, y + dy)
+    )
+
+
+MEMORY_SURFACES = {
+    "no event": lambda call: len(call.t) == 0,
+    "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
+    "no radius": lambda call: call.sums.shape[3] == 1,
+    "a neighbour in another cell": _around(
+        lambda call, x, y, i, j: (x // call.cell, y // call.cell) != (i // call.cell, j // call.cell)
+    ),
+    "beyond the sensor, in a cell that it cuts": _around(
+        lambda call, x, y, i, j: i >= call.memory.shape[2] and i // call.cell == x // call.cell
+    ),
+}
+TIME_SURFACES = {
+    "no event": lambda call: len(call.t) == 0,
+    "no radius": lambda call: call.out.shape[2] == 1,
+    "a pixel that was never seen": lambda call: call.out.size > 0 and call.latest.shape[1] > len(call.t),
+    "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
+}
+
+ROWS = {
+    "no row": lambda call: call.result == 0,
+    "rows": lambda call: call.result > 1,
+    "blanks separate": lambda call: call.separator == 0 and call.result > 0,
+    "points": lambda call: call.result > 0 and b"." in bytes(call.text),
+    "signs": lambda call: call.result > 0 and b"-" in bytes(call.text),
+    "an empty line": lambda call: call.result > 0 and b"\n  \n" in bytes(call.text),
+    "no end of the last line": lambda call: call.result > 0 and not bytes(call.text).endswith(b"\n"),
+    "no number": lambda call: call.result < 0 and b"x" in bytes(call.text),
+    "an exponent": lambda call: call.result < 0 and b"e" in bytes(call.text),
+    "19 digits": lambda call: call.result < 0 and b"1234567890123456789" in bytes(call.text),
+    "more than a float holds": lambda call: call.result < 0 and b"0.123456789012345678" in bytes(call.text),
+    "more rows than room": lambda call: (
+        call.result < 0 and bytes(call.text).count(b"\n") >= call.digits.shape[1]
+    ),
+}
+
+NO_EVENT = {"no event": lambda call: len(call.events) == 0}
+
+CASES = {
+    "decode_evt3": {"no word": lambda call: len(call.words) == 0},
+    "decode_libcaer_cmp": LIBCAER_CMP,
+    "decode_mono": MONO,
+    "decode_event_stream": EVENT_STREAM,
+    "decode_ecf": ECF,
+    "decode_groups": GROUPS,
+    "time_span": TIME_SPAN,
+    "mark_noise": NO_EVENT,
+    "parse_rows": ROWS,
+    "advance_to_bin": ADVANCE,
+    "count_event": COUNT_EVENT,
+    "start_of_bin": START_OF_BIN,
+    "slot_of": SLOT_OF,
+    "deviation": DEVIATION,
+    "whitened_square": WHITENED_SQUARE,
+    "soft_code": SOFT_CODE,
+    "triangle_code": TRIANGLE_CODE,
+    "mean_distance": MEAN_DISTANCE,
+    "fixed_distance": FIXED_DISTANCE,
+    "pool": POOL,
+    **LASSO,
+    "encode_volume": ENCODE_VOLUME,
+    "read_features": READ_FEATURES,
+    "mark_dirty": MARK_DIRTY,
+    "pool_volume": POOL_VOLUME,
+    "enter_code": ENTER_CODE,
+    "project_volume": PROJECT_VOLUME,
+    "complete": COMPLETE,
+    "list_missing": LIST_MISSING,
+    "look_ahead": LOOK_AHEAD,
+    "change_place": CHANGE_PLACE,
+    "change_volume": CHANGE_VOLUME,
+    "follow_changes": FOLLOW_CHANGES,
+    "move_volume": MOVE_VOLUME,
+    "move_code": MOVE_CODE,
+    "pool_soft": POOL_SOFT,
+    "change_moments": FORMS,
+    "renew": RENEW,
+    "follow_event": FOLLOW_EVENT,
+    "gather_volume": GATHER_VOLUME,
+    "list_entries": LIST_ENTRIES,
+    "sum_columns": SUM_COLUMNS,
+    "touched_bins": TOUCHED_BINS,
+    "add_memory_surfaces": MEMORY_SURFACES,
+    "time_surfaces": TIME_SURFACES,
+}
+"""By kernel: the name of each case, and when a call is one."""
+
+STEPS = {
+    "decode_evt3": (_evt3_steps, EVT3),
+    "mark_noise": (_noise_steps, NOISE),
+    "count_events": (_count_steps, COUNT_EVENTS),
+}
+"""By kernel that goes step by step: the steps of a call, and the cases that one of them is."""
