@@ -705,16 +705,6 @@ COMPLETE = {
     "a volume that is projected in part": lambda call: _current(call)[CURSOR_ENTRY] > 0,
     "volumes share a row": _shares_rows,
 }
-LIST_MISSING = {
-    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
-    "everything is missing": lambda call: _current(call)[CURSOR_CODED] == 0,
-    "from within a row of the grid": lambda call: _current(call)[CURSOR_CODED] % call.operator.shape[1] > 0,
-    "volumes share a row": _shares_rows,
-    "an empty volume is left out": lambda call: (
-        call.state.clock[CLOCK_NOW] > BEFORE_TIME and not call.state.applied.any(axis=0).all()
-    ),
-    "the lasso": lambda call: call.operator.inverse,
-}
 LOOK_AHEAD = {
     "one plane": lambda call: not _has_two(call),
     "the current plane is not complete": lambda call: (
@@ -782,13 +772,7 @@ CHANGE_VOLUME = FORMS | {
     "not empty before": lambda call: not _is_empty(call),
     "of the plane ahead": _is_ahead,
 }
-FOLLOW_CHANGES = CHANGE_VOLUME | {"several entries": lambda call: call.n > 1}
 MOVE_VOLUME = ENCODINGS | {"of the plane ahead": _is_ahead}
-POOL_SOFT = {
-    f"{name}, {kind_name}": lambda call, sign=sign, kind=kind: call.sign == sign and call.kind == kind
-    for name, sign in (("added", 1), ("taken", -1))
-    for kind_name, kind in (("soft", SOFT), ("split", SPLIT))
-}
 MOVE_CODE = {
     f"{name}, {kind_name}": lambda call, sign=sign, kind=kind: call.change == sign and call.kind == kind
     for name, sign in (("up", 1), ("down", -1))
@@ -854,30 +838,6 @@ GATHER_VOLUME = {
     "lines of vectors that overlap": lambda call: call.patch > 8 and call.start < call.end,
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
-LIST_ENTRIES = {
-    "none": lambda call: call.result == 0,
-    "several vectors": lambda call: call.result > 0 and call.end - call.start > 128,
-    "one that begins and ends within a vector": lambda call: (
-        call.result > 0 and call.start // 64 == (call.end - 1) // 64 and call.start % 64 > 0
-    ),
-    "one just before, that is not listed": lambda call: (
-        call.start % 64 > 0 and call.values[call.start - 1] != 0
-    ),
-    "one just behind": lambda call: call.end % 64 > 0 and call.values[call.end] != 0,
-}
-SUM_COLUMNS = {
-    "none": lambda call: call.n == 0,
-    "an odd number": lambda call: call.n % 2 == 1,
-    "an even one": lambda call: call.n > 0 and call.n % 2 == 0,
-    "one block": lambda call: len(call.sums) <= 96,
-    "blocks of several widths": lambda call: len(call.sums) > 96 and len(call.sums) % 96 > 0,
-}
-TOUCHED_BINS = {
-    "none": lambda call: call.result[0] >= call.result[1],
-    "the oldest bin": lambda call: call.result[0] == 0,
-    "the current bin": lambda call: call.result[1] == len(call.state.counts),
-    "some in the middle alone": lambda call: 0 < call.result[0] < call.result[1] < len(call.state.counts),
-}
 
 # Time surfaces.
 
@@ -932,7 +892,70 @@ ROWS = {
 
 NO_EVENT = {"no event": lambda call: len(call.events) == 0}
 
+
+def _coded(call):
+    return call.state.cursors[call.plane, CURSOR_CODED]
+
+
+FOLLOW_CHANGES = {
+    "its code moves": lambda call: (
+        not call.operator.inverse
+        and call.volume < _coded(call)
+        and call.state.moments[call.plane, call.volume, MOMENT_SQUARES] > 0
+    ),
+    "it was empty": lambda call: call.state.moments[call.plane, call.volume, MOMENT_SQUARES] == 0,
+    "it becomes empty": lambda call: (
+        call.n == np.count_nonzero(call.state.values[call.part, 0])
+        and call.n > 0
+        and (
+            call.state.values[call.part, 0, call.state.entries[call.part, : call.n]]
+            == -call.state.changes[call.part, : call.n]
+        ).all()
+    ),
+}
+
+LIST_MISSING = {
+    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
+    "all are missing": lambda call: _current(call)[CURSOR_CODED] == 0,
+    "some are there": lambda call: 0 < _current(call)[CURSOR_CODED] < _n_volumes(call.state),
+    "every one, for the inverse": lambda call: call.operator.inverse,
+    "no event at all": lambda call: not call.state.applied.any(),
+}
+
+LIST_ENTRIES = {
+    "nothing": lambda call: call.start >= call.end,
+    "all are zero": lambda call: call.start < call.end and not call.values[call.start : call.end].any(),
+    "none is zero": lambda call: call.start < call.end and call.values[call.start : call.end].all(),
+    "entries before the first": lambda call: call.values[: call.start].any(),
+    "entries behind the last": lambda call: call.values[call.end :].any(),
+}
+
+TOUCHED_BINS = {
+    "nothing changed": lambda call: not call.state.touched_slots.any(),
+    "one bin of several": lambda call: np.count_nonzero(call.state.touched_slots) == 1 and _bins(call) > 1,
+    "all bins": lambda call: call.state.touched_slots.all(),
+}
+
+POOL_SOFT = {
+    "soft": lambda call: call.kind == SOFT,
+    "split": lambda call: call.kind == SPLIT,
+    "added": lambda call: call.sign > 0,
+    "taken": lambda call: call.sign < 0,
+}
+
+SUM_COLUMNS = {
+    "no column": lambda call: call.n == 0,
+    "an even number": lambda call: call.n > 0 and call.n % 2 == 0,
+    "an odd number": lambda call: call.n % 2 == 1,
+}
+
 CASES = {
+    "follow_changes": FOLLOW_CHANGES,
+    "list_missing": LIST_MISSING,
+    "list_entries": LIST_ENTRIES,
+    "touched_bins": TOUCHED_BINS,
+    "pool_soft": POOL_SOFT,
+    "sum_columns": SUM_COLUMNS,
     "decode_evt3": {"no word": lambda call: len(call.words) == 0},
     "decode_libcaer_cmp": LIBCAER_CMP,
     "decode_mono": MONO,
@@ -961,21 +984,15 @@ CASES = {
     "enter_code": ENTER_CODE,
     "project_volume": PROJECT_VOLUME,
     "complete": COMPLETE,
-    "list_missing": LIST_MISSING,
     "look_ahead": LOOK_AHEAD,
     "change_place": CHANGE_PLACE,
     "change_volume": CHANGE_VOLUME,
-    "follow_changes": FOLLOW_CHANGES,
     "move_volume": MOVE_VOLUME,
     "move_code": MOVE_CODE,
-    "pool_soft": POOL_SOFT,
     "change_moments": FORMS,
     "renew": RENEW,
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
-    "list_entries": LIST_ENTRIES,
-    "sum_columns": SUM_COLUMNS,
-    "touched_bins": TOUCHED_BINS,
     "add_memory_surfaces": MEMORY_SURFACES,
     "time_surfaces": TIME_SURFACES,
 }

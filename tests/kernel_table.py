@@ -912,10 +912,10 @@ def end_in_a_volume(rng, operator, state):
 
 
 def make_mark_dirty(rng):
-    *sensor, operator, state = engine_with_news(rng)
+    operator, state = engine_with_news(rng)
     if rng.random() < 0.6:
         end_in_a_volume(rng, operator, state)
-    return *sensor, operator, state
+    return operator, state
 
 
 def make_renew(rng):

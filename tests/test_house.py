@@ -89,9 +89,6 @@ SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "soc
 COMPILING = {"kernels.cache", "kernels.compiled"}
 """Modules among the kernels that hold none: how they are compiled, and where machine code is kept."""
 
-VECTORS = {"kernels.vectors"}
-"""The module among the kernels whose functions write machine code: see the test of vector code."""
-
 CLOCKLESS = {"asyncio", "time", "logging", "io", "threading"}
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
@@ -193,8 +190,8 @@ def test_a_library_is_imported_where_it_belongs(library):
 @pytest.mark.parametrize("name", sorted(n for n in NAMES if n.startswith("kernels.")))
 def test_kernels_know_nothing_but_arrays(name):
     outside = {i.partition(".")[0] for i in imports_of(NAMES[name])} - {"streamfeat"}
-    more = {"llvmlite"} if name in VECTORS else set()
     if name not in COMPILING:
+        more = {"llvmlite"} if name == "kernels.vectors" else set()
         assert outside <= {"math", "numpy", "numba", "typing"} | more
     assert {i.partition(".")[0] for i in own_imports(NAMES[name])} <= {"kernels", "events"}
 
@@ -236,7 +233,9 @@ def test_nothing_in_a_module_can_run_what_it_reads_or_reorder_floats(name):
             )
 
 
-@pytest.mark.parametrize("name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING - VECTORS))
+@pytest.mark.parametrize(
+    "name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING - {"kernels.vectors"})
+)
 def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
         if isinstance(node, ast.FunctionDef):

@@ -15,6 +15,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from streamfeat.classify.calibration import (
+    checked_temperature,
+    fitted_temperature,
+    probabilities,
+    temperature_field,
+)
 from streamfeat.classify.folds import assign_folds, check_labels
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.errors import InputError
@@ -68,6 +74,7 @@ class Classifier(Shown):
         bias: `(C,)` or `(1,)` float32.
         fingerprint: of the encoder it was trained with.
         provenance: how it was trained (JSON values).
+        temperature: what makes probabilities of its scores, see `calibration`; None where it was not fitted.
     """
 
     labels: tuple[str, ...]
@@ -77,6 +84,7 @@ class Classifier(Shown):
     bias: NDArray[np.float32]
     fingerprint: str
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    temperature: float | None = None
     _folded: NDArray[np.float32] = field(init=False, repr=False, compare=False)
     _folded_bias: NDArray[np.float32] = field(init=False, repr=False, compare=False)
 
@@ -124,6 +132,11 @@ class Classifier(Shown):
         totals = np.reshape(products, (*features.shape[:-1], len(self.bias)))
         return _spread(totals / length + self._folded_bias)
 
+    def emitted(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What an emission says of every label: probabilities if there is a temperature, else scores."""
+        scores = self.scores(features)
+        return scores if self.temperature is None else probabilities(scores, self.temperature)
+
     def predict(self, features: NDArray[np.float32]) -> str:
         """The label with the highest score for features `(F,)`."""
         return self.labels[int(self.scores(features).argmax())]
@@ -154,7 +167,7 @@ class Classifier(Shown):
             "fingerprint": self.fingerprint,
             "provenance": dict(self.provenance),
         }
-        return arrays, header
+        return arrays, header | temperature_field(self.temperature)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -192,6 +205,7 @@ class Classifier(Shown):
                 **{name: arrays[name] for name in shapes},
                 fingerprint=fingerprint,
                 provenance=provenance,
+                temperature=checked_temperature(path, header),
             )
             # No score can be larger than this: normalised features have unit length.
             largest = np.abs(loaded._folded).sum(axis=0) + np.abs(loaded._folded_bias)
@@ -244,12 +258,16 @@ def train_classifier(
         (train, test, StandardScaler().fit(rows[train]), LinearSVM(warm_start=True)) for train, test in sides
     ]
 
+    numbers = np.unique(targets, return_inverse=True)[1]
+    held_out: dict[float, NDArray[np.float32]] = {}
+
     def score(c: float) -> float:
-        right = 0
+        found = held_out[c] = np.empty((len(targets), n_names), np.float32)
         for train, test, fold_scaler, svm in fitted:
             svm.set_params(C=c).fit(fold_scaler.transform(rows[train]), targets[train])
-            right += int(np.sum(svm.predict(fold_scaler.transform(rows[test])) == targets[test]))
-        return right / len(targets)
+            decision = svm.decision_function(fold_scaler.transform(rows[test]))
+            found[test] = _spread(decision.reshape(len(decision), -1))
+        return float(np.mean(found.argmax(axis=1) == numbers))
 
     scores = {c: score(c) for c in candidates} if candidates else _climb(score, len(targets))
     best = max(scores, key=lambda c: (scores[c], -c))
@@ -259,9 +277,10 @@ def train_classifier(
         labels=tuple(str(name) for name in svm.classes_),
         centre=scaler.mean_.astype(np.float32),
         scale=scaler.scale_.astype(np.float32),
-        weights=svm.coef_.T.astype(np.float32),
+        weights=np.ascontiguousarray(svm.coef_.T, np.float32),  # as files hold it, for the bits
         bias=svm.intercept_.astype(np.float32),
         fingerprint=encoder.fingerprint,
+        temperature=fitted_temperature(held_out[best], numbers),
         provenance={
             **(provenance or {}),
             "C": best,
@@ -365,6 +384,7 @@ class OnlineClassifier:
             bias=self._model.intercept_.astype(np.float32),
             fingerprint=old.fingerprint,
             provenance={**old.provenance, "learned_online": self.learned},
+            temperature=old.temperature,
         )
 
 

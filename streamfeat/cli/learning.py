@@ -223,6 +223,7 @@ def train(
     """Train a classifier on labelled samples; splits named validation or test are only scored."""
     import numpy as np
 
+    from streamfeat.classify.calibration import calibration_error
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
@@ -260,7 +261,7 @@ def train(
         trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
     found: Classifier | KernelClassifier = trained
     if kernel == "rbf":
-        found = train_kernel_classifier(rows, trained, np.asarray(labels))
+        found = train_kernel_classifier(rows, trained, np.asarray(labels), parts[numbers])
     found.save(classifier)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
@@ -272,9 +273,13 @@ def train(
         "cross_validation": max(trained.provenance["cross_validation"].values()),
     }
     if len(held_out):
-        predicted = [found.predict(row) for row in held_out]
-        share = (samples.labels[samples.held_out] == predicted).mean()
+        likely, true = found.emitted(held_out), samples.labels[samples.held_out]
+        share = (true == np.array(found.labels)[likely.argmax(axis=1)]).mean()
         result |= {"held_out_samples": len(held_out), "held_out_accuracy": round(float(share), 4)}
+        known = np.isin(true, found.labels)
+        if known.any():
+            places = np.searchsorted(found.labels, true[known])
+            result["held_out_calibration_error"] = round(calibration_error(likely[known], places), 4)
     print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)

@@ -169,16 +169,16 @@ SpeedOption = Annotated[
         help="1 is the recorded pace, 2 twice that, or max.", autocompletion=completing("1", "2", "max")
     ),
 ]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
+]
 ThreadsOption = Annotated[
     int | None,
     typer.Option(
         help="Threads that share a large emission; features are the same for any number.",
         show_default="all cores but one",
     ),
-]
-ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]

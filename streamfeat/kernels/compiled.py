@@ -1,7 +1,7 @@
 """How every kernel is compiled.
 
-Lives here: the decorators of the kernels, and the one of their vector code.
-Not here: the kernels, and where machine code is kept (`cache`).
+Lives here: the decorators of the kernels and of their vector code. Not here: the kernels, and where machine
+code is kept (`cache`).
 
 Kernels are compiled without numba's reference counts. With them each call of one kernel from another counts
 every array up and down, atomically, in tuples of forty: 480 ns an event, where counting it takes 10. An

@@ -30,7 +30,7 @@ class Emission:
         n_events: events counted by the session so far.
         features: `(n_features,)` float32.
         labels: names that the scores belong to; empty without a classifier.
-        scores: `(C,)` float32.
+        scores: `(C,)` float32, probabilities where the classifier was calibrated, as `train` does.
         sample: the labelled sample that is open, if any.
         final: this is the emission at the end of that sample, the one that is scored.
         topic: of the camera, where there may be several.

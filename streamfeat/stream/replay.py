@@ -104,8 +104,8 @@ class ReplayJob:
             learn_online=learn_online,
             clock=time.perf_counter,
             engine=engine,
-            threads=usable_threads(threads),
             load=Load(self._encoder.geometry, self.advice.append),
+            threads=usable_threads(threads),
         )
         self._seconds = self._compile_seconds = 0.0
         self.interrupted = False

@@ -70,8 +70,8 @@ class View:
         open_browser: show the page in a browser.
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
         loop: start a recording again at its end.
-        threads: that share a large emission, see `usable_threads`.
         labels: labels of the recording that the page changes.
+        threads: that share a large emission, see `usable_threads`.
         say: told addresses, and what is waited for.
         options: further ones of `PlayJob`, `WatchJob` or `ListenJob`.
 
@@ -93,8 +93,8 @@ class View:
         open_browser: bool = False,
         speed: float | None = 1.0,
         loop: bool = False,
-        threads: int | None = None,
         labels: LabelSheet | None = None,
+        threads: int | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
