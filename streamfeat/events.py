@@ -20,7 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from streamfeat.errors import InputError
 
-__all__ = ["EVENT_DTYPE", "FIELD_NAMES", "Events", "Resolution", "as_events", "make_events"]
+__all__ = [
+    "EVENT_DTYPE",
+    "FIELD_NAMES",
+    "TIME_LIMIT",
+    "Events",
+    "Resolution",
+    "as_events",
+    "is_valid",
+    "make_events",
+]
 
 EVENT_DTYPE = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")], align=True)
 """One event, 16 bytes, the layout of Metavision's EventCD.
@@ -33,6 +42,28 @@ Events = NDArray[np.void]
 
 Resolution = tuple[int, int]
 """`(height, width)` in pixels, always in this order."""
+
+TIME_LIMIT = 1 << 62
+"""Stream times lie between minus and plus this many microseconds, both excluded."""
+
+
+def is_valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
+    """Which events may be counted: inside the sensor, polarity 0 or 1, time within `TIME_LIMIT`.
+
+    This is the one rule; kernels, which see events one by one, have it in `kernels.ingest.is_valid`.
+
+    Args:
+        events: `(n,)` EVENT_DTYPE, not changed.
+        resolution: `(height, width)` of the sensor.
+
+    Returns:
+        `(n,)` bool.
+    """
+    height, width = resolution
+    p, t = events["p"], events["t"]
+    inside = (events["x"] < width) & (events["y"] < height)
+    valid: NDArray[np.bool_] = inside & ((p == 0) | (p == 1)) & (t > -TIME_LIMIT) & (t < TIME_LIMIT)
+    return valid
 
 
 def make_events(x: ArrayLike, y: ArrayLike, p: ArrayLike, t: ArrayLike) -> Events:
@@ -61,7 +92,7 @@ FIELD_NAMES = {
 }
 """What each field of `EVENT_DTYPE` is called elsewhere."""
 
-_RANGE = {"x": (0, 0xFFFF), "y": (0, 0xFFFF), "p": (-1, 1), "t": (-(1 << 62), 1 << 62)}
+_RANGE = {"x": (0, 0xFFFF), "y": (0, 0xFFFF), "p": (-1, 1), "t": (-TIME_LIMIT, TIME_LIMIT)}
 _WANTED = {"x": "columns", "y": "rows", "p": "polarity", "t": "microseconds"}
 _UNUSABLE = 2
 """A polarity that every kernel rejects, and counts."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
+    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_PLANE,
     CLOCK_START,
@@ -617,6 +618,251 @@ MARK_DIRTY = {
     ),
 }
 
+# Volumes that enter planes, and planes that are filled.
+
+
+def _n_volumes(state):
+    return len(state.cells)
+
+
+def _shares_rows(call):
+    return call.state.projections.shape[1] == 1
+
+
+def _row_of(call):
+    """The moments of a call's volume."""
+    row = getattr(call, "row", call.volume)
+    return call.state.moments[call.plane, min(int(row), call.state.projections.shape[1] - 1)]
+
+
+def _is_empty(call):
+    return _row_of(call)[MOMENT_SQUARES] == 0
+
+
+def _has_form(call):
+    return call.operator.quadratic.size > 0
+
+
+def _is_ahead(call):
+    return call.plane != call.state.clock[CLOCK_PLANE]
+
+
+def _cursors(call):
+    return call.state.cursors[call.plane].tolist()
+
+
+def _current(call):
+    return call.state.cursors[call.state.clock[CLOCK_PLANE]].tolist()
+
+
+def _coming(call):
+    return call.state.cursors[1 - call.state.clock[CLOCK_PLANE]].tolist()
+
+
+def _has_two(call):
+    return len(call.state.cursors) == 2
+
+
+FORMS = {"with a quadratic form": _has_form, "without one": lambda call: not _has_form(call)}
+ENCODINGS = {
+    name: lambda call, kind=kind: call.operator.kind == kind and not call.operator.inverse
+    for name, kind in (("soft", SOFT), ("split", SPLIT), ("triangle", TRIANGLE))
+}
+
+POOL_VOLUME = ENCODINGS | {
+    "added": lambda call: call.sign > 0 and not _is_empty(call),
+    "taken": lambda call: call.sign < 0 and not _is_empty(call),
+    "empty": _is_empty,
+    "of the plane ahead": _is_ahead,
+}
+ENTER_CODE = ENCODINGS | {
+    "empty": lambda call: not call.result,
+    "not empty": lambda call: call.result,
+    "volumes share a row": _shares_rows,
+    "of the plane ahead": _is_ahead,
+}
+PROJECT_VOLUME = FORMS | {
+    "from the first entry, over what the row held": lambda call: call.start == 0 and not _is_empty(call),
+    "from the middle": lambda call: call.start > 0,
+    "ends at the most that was asked": lambda call: (
+        call.result[0] == call.most and call.result[1] < (_bins(call) - call.ahead) * call.operator.patch**2
+    ),
+    "ends with the volume": lambda call: (
+        call.result[1] == (_bins(call) - call.ahead) * call.operator.patch**2
+    ),
+    "nothing to let in": lambda call: call.result[0] == 0,
+    "ahead": lambda call: call.ahead == 1,
+    "volumes share a row": _shares_rows,
+}
+COMPLETE = {
+    "the upper part": lambda call: call.part == 0,
+    "the lower part": lambda call: call.part == 1,
+    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
+    "everything is missing": lambda call: _current(call)[CURSOR_PROJECTED] == 0,
+    "a volume that is projected and has no code": lambda call: (
+        _current(call)[CURSOR_CODED] < _current(call)[CURSOR_PROJECTED]
+    ),
+    "a volume that is projected in part": lambda call: _current(call)[CURSOR_ENTRY] > 0,
+    "volumes share a row": _shares_rows,
+}
+LOOK_AHEAD = {
+    "one plane": lambda call: not _has_two(call),
+    "the current plane is not complete": lambda call: (
+        _has_two(call) and _current(call)[CURSOR_CODED] < _n_volumes(call.state)
+    ),
+    "no budget": lambda call: call.budget <= 0,
+    "the budget is spent": lambda call: call.budget > 0 >= call.result,
+    "the goals are reached": lambda call: call.result > 0 and _has_two(call),
+    "goes on in the middle of a volume": lambda call: (
+        _has_two(call) and call.budget > 0 and _coming(call)[CURSOR_ENTRY] > 0
+    ),
+    "more codes than projections are asked for": lambda call: _has_two(call) and call.coded > call.projected,
+    "all are projected already": lambda call: (
+        _has_two(call) and _coming(call)[CURSOR_PROJECTED] == _n_volumes(call.state)
+    ),
+}
+
+# One entry that changes, and volumes that changed.
+
+
+def _after(call):
+    return np.clip(
+        call.state.counts[naive.slot_of(call.position, call.state), call.row, call.column],
+        -call.operator.max_count,
+        call.operator.max_count,
+    )
+
+
+def _covering(call):
+    """Volumes over the entry of a call, and the entry of each in the plane that looks ahead."""
+    state, operator = call.state, call.operator
+    columns = (getattr(call, "shape", None) or operator.shape)[1]
+    patch, stride = operator.patch, operator.stride
+    for volume in range(len(state.cells)):
+        row, column = call.row - volume // columns * stride, call.column - volume % columns * stride
+        if 0 <= row < patch and 0 <= column < patch:
+            yield volume, ((call.position - 1) * patch + row) * patch + column
+
+
+def _partly_ahead(holds):
+    """Whether it holds of an entry in the volume that is projected in part ahead, and of where that ends."""
+    return lambda call: (
+        _has_two(call)
+        and any(
+            volume == _coming(call)[CURSOR_PROJECTED]
+            and call.position > 0
+            and holds(entry, _coming(call)[CURSOR_ENTRY])
+            for volume, entry in _covering(call)
+        )
+    )
+
+
+CHANGE_PLACE = FORMS | {
+    "no volume covers it": lambda call: not list(_covering(call)),
+    "several volumes cover it": lambda call: len(list(_covering(call))) > 1,
+    "in the oldest bin, which the plane ahead has lost": lambda call: _has_two(call) and call.position == 0,
+    "inside what is projected ahead of a volume": _partly_ahead(lambda entry, end: entry < end),
+    "beyond what is projected ahead of a volume": _partly_ahead(lambda entry, end: 0 < end <= entry),
+    "a count becomes zero": lambda call: _after(call) == 0,
+    "a count becomes the largest": lambda call: abs(_after(call)) == call.operator.max_count,
+}
+CHANGE_VOLUME = FORMS | {
+    "with a code": lambda call: call.volume < _cursors(call)[CURSOR_CODED],
+    "empty before": _is_empty,
+    "not empty before": lambda call: not _is_empty(call),
+    "of the plane ahead": _is_ahead,
+}
+MOVE_VOLUME = ENCODINGS | {"of the plane ahead": _is_ahead}
+MOVE_CODE = {
+    f"{name}, {kind_name}": lambda call, sign=sign, kind=kind: call.change == sign and call.kind == kind
+    for name, sign in (("up", 1), ("down", -1))
+    for kind_name, kind in (("soft", SOFT), ("split", SPLIT))
+}
+
+
+def _dirty(holds):
+    """Whether it holds of a dirty volume: `(volume, is ahead, cursors of its plane)`."""
+
+    def any_holds(call):
+        n, state = _n_volumes(call.state), call.state
+        found = [divmod(int(index), n) for index in state.dirty[: state.clock[CLOCK_DIRTY]]]
+        return any(
+            holds(volume, plane != state.clock[CLOCK_PLANE], state.cursors[plane].tolist())
+            for plane, volume in found
+        )
+
+    return any_holds
+
+
+RENEW = FORMS | {
+    "nothing is dirty": lambda call: call.state.clock[CLOCK_DIRTY] == 0,
+    "a volume with a code": _dirty(lambda volume, ahead, cursors: volume < cursors[CURSOR_CODED]),
+    "a volume without a code": _dirty(
+        lambda volume, ahead, cursors: cursors[CURSOR_CODED] <= volume < cursors[CURSOR_PROJECTED]
+    ),
+    "a volume that is projected in part": _dirty(
+        lambda volume, ahead, cursors: volume == cursors[CURSOR_PROJECTED]
+    ),
+    "a volume of the plane ahead": _dirty(lambda volume, ahead, cursors: ahead),
+    "the upper part": lambda call: call.part == 0,
+    "the lower part": lambda call: call.part == 1,
+}
+FOLLOW_EVENT = {
+    name: COUNT_EVENT[name]
+    for name in (
+        "outside, by its column",
+        "a polarity above",
+        "in the current bin",
+        "in the next bin",
+        "far too late",
+    )
+} | {
+    "one plane": lambda call: not _has_two(call),
+    "two planes": _has_two,
+}
+
+# Lists of entries.
+
+
+def _line(call):
+    return call.patch**2
+
+
+GATHER_VOLUME = {
+    "the ring wraps": lambda call: call.first_slot > 0,
+    "the ring does not": lambda call: call.first_slot == 0,
+    "all entries": lambda call: call.end == len(call.values),
+    "none": lambda call: call.end == 0,
+    "an end within a bin": lambda call: call.end % _line(call) > 0,
+    "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
+}
+LIST_FILLED = {
+    "as many as asked, and more are there": lambda call: (
+        call.result[0] == call.most and (call.result[1] < call.end)
+    ),
+    "all": lambda call: call.result[0] > 0 and call.result[1] == call.end,
+    "none": lambda call: call.result[0] == 0,
+    "from within a row": lambda call: call.start % call.patch > 0,
+    "the ring wraps": lambda call: call.first_slot > 0,
+    "without the newest bin": lambda call: call.end < len(call.entries),
+}
+LIST_CHANGED = {
+    "none": lambda call: call.result == 0,
+    "some": lambda call: call.result > 0,
+    "a slot that is not looked at, with a change": lambda call: (
+        (call.counts.clip(-call.limit, call.limit) != call.applied).any(axis=(1, 2)) & (call.slots == 0)
+    ).any(),
+    "beyond the limit": lambda call: (np.abs(call.counts) > call.limit).any(),
+    "an end within a row": lambda call: call.end % call.patch > 0,
+    "the ring wraps": lambda call: call.first_slot > 0,
+}
+ADD_COLUMNS = {
+    "none": lambda call: call.n == 0,
+    "fewer than four": lambda call: 0 < call.n < 4,
+    "fours alone": lambda call: call.n > 0 and call.n % 4 == 0,
+    "fours and a rest": lambda call: call.n > 4 and call.n % 4 > 0,
+}
+
 # Time surfaces.
 
 
@@ -651,6 +897,23 @@ TIME_SURFACES = {
     "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
 }
 
+ROWS = {
+    "no row": lambda call: call.result == 0,
+    "rows": lambda call: call.result > 1,
+    "blanks separate": lambda call: call.separator == 0 and call.result > 0,
+    "points": lambda call: call.result > 0 and b"." in bytes(call.text),
+    "signs": lambda call: call.result > 0 and b"-" in bytes(call.text),
+    "an empty line": lambda call: call.result > 0 and b"\n  \n" in bytes(call.text),
+    "no end of the last line": lambda call: call.result > 0 and not bytes(call.text).endswith(b"\n"),
+    "no number": lambda call: call.result < 0 and b"x" in bytes(call.text),
+    "an exponent": lambda call: call.result < 0 and b"e" in bytes(call.text),
+    "19 digits": lambda call: call.result < 0 and b"1234567890123456789" in bytes(call.text),
+    "more than a float holds": lambda call: call.result < 0 and b"0.123456789012345678" in bytes(call.text),
+    "more rows than room": lambda call: (
+        call.result < 0 and bytes(call.text).count(b"\n") >= call.digits.shape[1]
+    ),
+}
+
 NO_EVENT = {"no event": lambda call: len(call.events) == 0}
 
 CASES = {
@@ -662,6 +925,7 @@ CASES = {
     "decode_groups": GROUPS,
     "time_span": TIME_SPAN,
     "mark_noise": NO_EVENT,
+    "parse_rows": ROWS,
     "advance_to_bin": ADVANCE,
     "count_event": COUNT_EVENT,
     "start_of_bin": START_OF_BIN,
@@ -677,6 +941,22 @@ CASES = {
     "encode_volume": ENCODE_VOLUME,
     "read_features": READ_FEATURES,
     "mark_dirty": MARK_DIRTY,
+    "pool_volume": POOL_VOLUME,
+    "enter_code": ENTER_CODE,
+    "project_volume": PROJECT_VOLUME,
+    "complete": COMPLETE,
+    "look_ahead": LOOK_AHEAD,
+    "change_place": CHANGE_PLACE,
+    "change_volume": CHANGE_VOLUME,
+    "move_volume": MOVE_VOLUME,
+    "move_code": MOVE_CODE,
+    "change_moments": FORMS,
+    "renew": RENEW,
+    "follow_event": FOLLOW_EVENT,
+    "gather_volume": GATHER_VOLUME,
+    "list_filled": LIST_FILLED,
+    "list_changed": LIST_CHANGED,
+    "add_columns": ADD_COLUMNS,
     "add_memory_surfaces": MEMORY_SURFACES,
     "time_surfaces": TIME_SURFACES,
 }

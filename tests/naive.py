@@ -1,6 +1,7 @@
 """Slow, obvious twins of the compiled kernels: each `@njit` function has one of the same name here."""
 
 import math
+import re
 
 import numpy as np
 
@@ -211,6 +212,30 @@ def decode_groups(data, size, at, bits, out):
     return at
 
 
+def parse_rows(text, separator, wanted, digits, decimals):
+    n = 0
+    for line in bytes(text).split(b"\n"):
+        line = line.strip(b" \t")
+        if not line:
+            continue
+        if n == digits.shape[1]:
+            return -1
+        fields = re.split(re.escape(bytes([separator])) if separator else rb"[ \t]+", line)
+        if len(fields) <= max(wanted):
+            return -1
+        for k, i in enumerate(wanted):
+            number = re.fullmatch(rb"([+-]?)([0-9]*)(?:\.([0-9]*))?", fields[i].strip(b" \t"))
+            if number is None:
+                return -1
+            whole, behind = number[2], number[3] or b""
+            if not 1 <= len(whole + behind) <= 18 or (behind and int(whole + behind) >= 2**53):
+                return -1
+            digits[k, n] = int(number[1] + whole + behind)
+            decimals[k, n] = len(behind)
+        n += 1
+    return n
+
+
 def _write(events, out):
     for i, event in enumerate(events):
         out[i] = event
@@ -259,6 +284,10 @@ def pool(code, sign, kind, pooled):
     code = code.astype(np.int64)
     parts = [code, np.abs(code)] if kind == SPLIT else [code]
     pooled += sign * np.concatenate(parts)
+
+
+def pool_soft(sign, projection, factor, offset, threshold, kind, pooled):
+    pool(_soft(projection, factor, offset, threshold), sign, kind, pooled)
 
 
 def _soft(projection, factor, offset, threshold):
@@ -322,11 +351,15 @@ def slot_of(position, state):
     return (int(state.clock[CLOCK_SLOT]) + 1 + position) % len(state.counts)
 
 
+def is_valid(x, y, p, t, state):
+    height, width = len(state.ring_rows), len(state.ring_columns)
+    return x < width and y < height and p in (0, 1) and abs(int(t)) < 2**62
+
+
 def count_event(x, y, p, t, operator, state):
     counts, clock, tally = state.counts, state.clock, state.tally
     n_bins, limit = len(counts), operator.max_count
-    height, width = len(state.ring_rows), len(state.ring_columns)
-    if not (x < width and y < height and p in (0, 1) and abs(int(t)) < 2**62):
+    if not is_valid(x, y, p, t, state):
         tally[TALLY_REJECTED] += 1
         return -1, 0, 0
     bin_index = (int(t) - int(clock[CLOCK_ORIGIN])) // operator.bin_us
@@ -458,8 +491,8 @@ def add_column(change, column, projection):
     projection += change * column.astype(np.int32)
 
 
-def add_columns(n, entries, changes, columns, projection):
-    projection += changes[:n].astype(np.int64) @ columns[entries[:n]].astype(np.int64)
+def sum_columns(n, entries, changes, columns, sums):
+    sums[:] = changes[:n].astype(np.int64) @ columns[entries[:n]].astype(np.int64)
 
 
 def sums_of(values, operator):
@@ -472,55 +505,37 @@ def sums_of(values, operator):
     return (v @ operator.columns.astype(np.int64)).astype(np.int32), moments
 
 
-def change_moments(entry, change, values, operator, moments):
-    _, before = sums_of(values, operator)
-    values[entry] += change
-    _, after = sums_of(values, operator)
+def add_moments(n, changes, moments):
+    moments[:2] += sum(changes[:n].tolist()), sum(change**2 for change in changes[:n].tolist())
+
+
+def change_moments(n, entries, changes, values, operator, moments):
+    d = len(operator.columns)
+    _, before = sums_of(values[:d], operator)
+    values[entries[:n]] += changes[:n]
+    _, after = sums_of(values[:d], operator)
     moments += after - before
 
 
-def change_entries(n, entries, changes, values, operator, projection, moments):
-    before = sums_of(values, operator)
-    values[entries[:n]] += changes[:n]
-    after = sums_of(values, operator)
-    projection += after[0] - before[0]
-    moments += after[1] - before[1]
+def change_entries(n, entries, changes, values, operator, projection, moments, sums):
+    projection += changes[:n].astype(np.int32) @ operator.columns[entries[:n]].astype(np.int32)
+    change_moments(n, entries, changes, values, operator, moments)
 
 
-def gather_volume(ring, first_slot, end, top, left, patch, values):
+def gather_volume(ring, first_slot, start, end, top, left, patch, values):
     oldest_first = np.roll(ring, -first_slot, axis=0)
-    values[:] = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
-    values[end:] = 0
+    volume = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
+    first, last = start // patch * patch, -(-end // patch) * patch  # whole lines
+    values[first:last] = volume[first:last]
 
 
-def list_filled(ring, first_slot, start, end, most, top, left, patch, entries, changes):
-    values = np.zeros(len(entries), np.int16)
-    gather_volume(ring, first_slot, end, top, left, patch, values)
-    values[:start] = 0
-    filled = np.flatnonzero(values)
-    listed = filled[:most]
+def list_entries(values, start, end, entries, changes):
+    listed = start + np.flatnonzero(values[start:end])
     entries[: len(listed)], changes[: len(listed)] = listed, values[listed]
-    return len(listed), int(filled[most]) if len(filled) > most else end
-
-
-def list_changed(counts, applied, limit, slots, first_slot, end, top, left, patch, entries, changes, values):
-    now, was = np.zeros((2, len(values)), np.int64)
-    clipped = counts.clip(-limit, limit)
-    clipped[slots == 0] = applied[slots == 0]
-    gather_volume(clipped, first_slot, end, top, left, patch, now)
-    gather_volume(applied, first_slot, end, top, left, patch, was)
-    listed = np.flatnonzero(now != was)
-    n = len(listed)
-    entries[:n], changes[:n], values[listed] = listed, (now - was)[listed], was[listed]
-    return n
+    return len(listed)
 
 
 # streamfeat.kernels.encode
-
-
-def lower_part(shape, pooling):
-    rows = [row for row in range(shape[0]) if cell((row, 0), shape, pooling)[0] < pooling / 2]
-    return len(rows) * shape[1]
 
 
 def cell(place, shape, pooling):
@@ -531,6 +546,11 @@ def cell(place, shape, pooling):
 def cell_index(volume, shape, pooling):
     row, column = cell(divmod(volume, shape[1]), shape, pooling)
     return row * pooling + column
+
+
+def volumes_of(operator):
+    rows, columns = operator.shape
+    return rows * columns
 
 
 def encode_volume(projection, moments, atoms, fresh, part, operator, state):
@@ -552,15 +572,12 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
         soft_code(projection, sigma, operator, code)
 
 
-def pool_volume(plane, row, volume, sign, part, shape, operator, state):
+def pool_volume(plane, row, volume, sign, part, operator, state):
     row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
     encode_volume(*row_of, sign > 0, part, operator, state)
-    pool(
-        state.code[part, 0],
-        sign,
-        operator.kind,
-        state.pooled[plane, cell_index(volume, shape, operator.pooling)],
-    )
+    sums = [state.pooled, *state.partial][part]
+    cell_of_volume = cell_index(volume, operator.shape, operator.pooling)
+    pool(state.code[part, 0], sign, operator.kind, sums[plane, cell_of_volume])
     state.encoded[part] += sign > 0
 
 
@@ -576,19 +593,19 @@ def read_features(operator, state, features):
 # streamfeat.kernels.planes
 
 
-def _gather(ring, ahead, volume, shape, operator, state):
+def _gather(ring, ahead, volume, operator, state):
     """Entries of a volume as they are after `ahead` more bins."""
-    n_bins = len(ring)
-    top, left = (index * operator.stride for index in divmod(volume, shape[1]))
-    values = np.zeros(state.values.shape[1], np.int64)
-    end = (n_bins - ahead) * operator.patch**2
-    gather_volume(ring, slot_of(ahead, state), end, top, left, operator.patch, values)
-    return values
+    n_bins, patch = len(ring), operator.patch
+    top, left = (index * operator.stride for index in divmod(volume, operator.shape[1]))
+    oldest_first = np.roll(ring, -slot_of(0, state), axis=0)
+    bins = [*oldest_first[ahead:], *np.zeros_like(ring[:ahead])]
+    assert len(bins) == n_bins
+    return np.array([pixels[top : top + patch, left : left + patch] for pixels in bins], int).ravel()
 
 
-def project_volume(plane, volume, ahead, start, most, part, shape, operator, state):
+def project_volume(plane, volume, ahead, start, most, part, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
-    values = _gather(state.applied, ahead, volume, shape, operator, state)
+    values = _gather(state.applied, ahead, volume, operator, state)
     (filled,) = np.nonzero(values[start:])
     end = (len(state.applied) - ahead) * operator.patch**2
     following = int(start + filled[most]) if len(filled) > most else end
@@ -597,27 +614,68 @@ def project_volume(plane, volume, ahead, start, most, part, shape, operator, sta
     return min(most, len(filled)), following
 
 
-def enter_code(plane, volume, part, shape, operator, state):
+def enter_code(plane, volume, part, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
     if not state.moments[plane, row].any():
         state.atoms[plane, row] = 0
         return False
-    pool_volume(plane, row, volume, 1, part, shape, operator, state)
+    pool_volume(plane, row, volume, 1, part, operator, state)
     return True
 
 
-def complete(part, shape, operator, state):
-    plane, half = int(state.clock[CLOCK_PLANE]), lower_part(shape, operator.pooling)
-    cursors, everything = state.cursors[plane], state.values.shape[1]
-    for volume in [range(half), range(half, shape[0] * shape[1])][part]:
+def count_filled(ring, stride, patch, lines, crowds):
+    for row, filled in enumerate(ring.any(axis=0)):
+        for c in range(crowds.shape[1]):
+            crowds[row, c] = filled[c * stride : c * stride + patch].sum()
+
+
+def list_missing(operator, state):
+    plane, missing = int(state.clock[CLOCK_PLANE]), []
+    for volume in range(state.cursors[plane, CURSOR_CODED], volumes_of(operator)):
+        held = (
+            state.moments.shape[1] == volumes_of(operator)
+            and state.moments[plane, volume, MOMENT_SQUARES] != 0
+        )
+        if held or operator.inverse or _gather(state.applied, 0, volume, operator, state).any():
+            missing.append(volume)
+    state.dirty[: len(missing)] = missing
+    state.clock[CLOCK_DIRTY] = len(missing)
+
+
+def share_of(part, parts, state):
+    n = int(state.clock[CLOCK_DIRTY])
+    cuts = [math.floor(n * i / parts) for i in range(parts + 1)]
+    return cuts[part], cuts[part + 1]
+
+
+def complete(part, parts, operator, state):
+    plane = int(state.clock[CLOCK_PLANE])
+    cursors, everything = state.cursors[plane], len(operator.columns)
+    for volume in state.dirty[slice(*share_of(part, parts, state))].tolist():
         if volume >= cursors[CURSOR_PROJECTED]:
-            project_volume(plane, volume, 0, 0, everything, part, shape, operator, state)
-        if volume >= cursors[CURSOR_CODED]:
-            enter_code(plane, volume, part, shape, operator, state)
+            project_volume(plane, volume, 0, 0, everything, part, operator, state)
+        enter_code(plane, volume, part, operator, state)
 
 
-def look_ahead(projected, coded, budget, shape, operator, state):
-    current, volumes = int(state.clock[CLOCK_PLANE]), shape[0] * shape[1]
+def add_up(parts, state):
+    state.pooled[:] = state.pooled + state.partial[: parts - 1].sum(axis=0, dtype=np.int32)
+    state.partial[: parts - 1] = 0
+
+
+def finish(parts, operator, state):
+    add_up(parts, state)
+    state.cursors[int(state.clock[CLOCK_PLANE])] = volumes_of(operator), volumes_of(operator), 0
+    state.clock[CLOCK_DIRTY] = 0
+
+
+def fill_plane(operator, state):
+    list_missing(operator, state)
+    complete(0, 1, operator, state)
+    finish(1, operator, state)
+
+
+def look_ahead(projected, coded, budget, operator, state):
+    current, volumes = int(state.clock[CLOCK_PLANE]), volumes_of(operator)
     if len(state.cursors) == 1 or state.cursors[current, CURSOR_CODED] != volumes:
         return budget
     plane, part = 1 - current, 0
@@ -625,15 +683,15 @@ def look_ahead(projected, coded, budget, shape, operator, state):
     while budget > 0 and cursors[CURSOR_PROJECTED] < projected:
         volume, start = (int(cursor) for cursor in cursors[[CURSOR_PROJECTED, CURSOR_ENTRY]])
         held = start or state.moments[plane, volume].any()
-        n, following = project_volume(plane, volume, 1, start, budget, part, shape, operator, state)
-        if held or _gather(state.applied, 0, volume, shape, operator, state).any():
+        n, following = project_volume(plane, volume, 1, start, budget, part, operator, state)
+        if held or _gather(state.applied, 0, volume, operator, state).any():
             budget -= 1 + n
         if following == (len(state.applied) - 1) * operator.patch**2:
             volume, following = volume + 1, 0
         cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY] = volume, following
     while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
         volume = int(cursors[CURSOR_CODED])
-        budget -= 6 * enter_code(plane, volume, part, shape, operator, state)
+        budget -= 6 * enter_code(plane, volume, part, operator, state)
         cursors[CURSOR_CODED] += 1
     return budget
 
@@ -646,124 +704,126 @@ def _entries_in(plane, volume, state):
     cursors = state.cursors[plane]
     if volume == cursors[CURSOR_PROJECTED]:
         return int(cursors[CURSOR_ENTRY])
-    return state.values.shape[1] if volume < cursors[CURSOR_PROJECTED] else 0
+    return state.changes.shape[1] - 1 if volume < cursors[CURSOR_PROJECTED] else 0
 
 
-def _changed_volumes(after, shape, operator, state):
+def _changed_volumes(after, operator, state):
     """`(plane, volume, entries)` of every volume whose entries are not those that were applied."""
     for plane in range(len(state.cursors)):
         ahead = int(plane != state.clock[CLOCK_PLANE])
-        for volume in range(shape[0] * shape[1]):
-            old, new = (
-                _gather(ring, ahead, volume, shape, operator, state) for ring in (state.applied, after)
-            )
+        for volume in range(volumes_of(operator)):
+            old, new = (_gather(ring, ahead, volume, operator, state) for ring in (state.applied, after))
             end = _entries_in(plane, volume, state)
             new[end:] = 0
             if (new[:end] != old[:end]).any():
                 yield plane, volume, new
 
 
-def _follow_volume(plane, volume, values, part, shape, operator, state):
+def _follow_volume(plane, volume, values, part, operator, state):
     coded = volume < state.cursors[plane, CURSOR_CODED]
     if coded:
-        pool_volume(plane, volume, volume, -1, part, shape, operator, state)
+        pool_volume(plane, volume, volume, -1, part, operator, state)
     state.projections[plane, volume], state.moments[plane, volume] = sums_of(values, operator)
     if coded:
-        pool_volume(plane, volume, volume, 1, part, shape, operator, state)
+        pool_volume(plane, volume, volume, 1, part, operator, state)
 
 
 def _clipped(operator, state):
     return state.counts.clip(-operator.max_count, operator.max_count).astype(np.int16)
 
 
-def mark_dirty(shape, operator, state):
-    after, n_volumes = _clipped(operator, state), shape[0] * shape[1]
-    changed = _changed_volumes(after, shape, operator, state)
+def mark_dirty(operator, state):
+    after, n_volumes = _clipped(operator, state), volumes_of(operator)
+    changed = _changed_volumes(after, operator, state)
     dirty = [plane * n_volumes + volume for plane, volume, _ in changed]
     state.touched_slots[:] = (after != state.applied).any(axis=(1, 2))
+    state.news[:] = after - state.applied
     state.is_dirty[dirty] = 1
     state.dirty[: len(dirty)] = dirty
     state.clock[CLOCK_DIRTY] = len(dirty)
 
 
-def renew(part, shape, operator, state):
-    for plane, volume, values in list(_changed_volumes(_clipped(operator, state), shape, operator, state)):
-        if part == (volume >= lower_part(shape, operator.pooling)):
-            _follow_volume(plane, volume, values, part, shape, operator, state)
+def touched_bins(state):
+    n_bins = len(state.counts)
+    touched = [position for position in range(n_bins) if state.touched_slots[slot_of(position, state)]]
+    return min(touched, default=n_bins), max(touched, default=-1) + 1
 
 
-def settle(operator, state):
-    state.applied[:] = _clipped(operator, state)
+def renew(part, parts, operator, state):
+    mine = state.dirty[slice(*share_of(part, parts, state))].tolist()
+    for plane, volume, values in list(_changed_volumes(_clipped(operator, state), operator, state)):
+        if plane * volumes_of(operator) + volume in mine:
+            _follow_volume(plane, volume, values, part, operator, state)
+
+
+def settle(state):
+    state.applied[:] = state.applied + state.news
+    state.news[:] = 0
     state.is_touched[:] = 0
     state.is_dirty[:] = 0
     state.clock[[CLOCK_TOUCHED, CLOCK_DIRTY]] = 0
 
 
-def finish(shape, state):
-    state.cursors[int(state.clock[CLOCK_PLANE])] = shape[0] * shape[1], shape[0] * shape[1], 0
+def update(operator, state):
+    mark_dirty(operator, state)
+    renew(0, 1, operator, state)
+    settle(state)
+    fill_plane(operator, state)
 
 
-def update(shape, operator, state):
-    mark_dirty(shape, operator, state)
-    for part in range(2):
-        renew(part, shape, operator, state)
-    settle(operator, state)
-    for part in range(2):
-        complete(part, shape, operator, state)
-    finish(shape, state)
-
-
-def read(shape, operator, state, features):
-    update(shape, operator, state)
+def read(operator, state, features):
+    update(operator, state)
     read_features(operator, state, features)
 
 
 # streamfeat.kernels.change
 
 
-def change_volume(plane, volume, entry, change, shape, operator, state):
-    values = _gather(state.applied, int(plane != state.clock[CLOCK_PLANE]), volume, shape, operator, state)
+def change_volume(plane, volume, n, part, operator, state):
+    values = _gather(state.applied, int(plane != state.clock[CLOCK_PLANE]), volume, operator, state)
     values[_entries_in(plane, volume, state) :] = 0
-    values[entry] += change
-    _follow_volume(plane, volume, values, 0, shape, operator, state)
+    values[state.entries[part, :n]] += state.changes[part, :n]
+    _follow_volume(plane, volume, values, part, operator, state)
 
 
-def move_volume(plane, volume, entry, change, shape, operator, state):
-    change_volume(plane, volume, entry, change, shape, operator, state)
+def move_volume(plane, volume, n, part, operator, state):
+    change_volume(plane, volume, n, part, operator, state)
 
 
-def change_place(position, row, column, shape, operator, state):
+def follow_changes(plane, volume, n, part, operator, state):
+    change_volume(plane, volume, n, part, operator, state)
+
+
+def change_place(position, row, column, operator, state):
     after, entry = state.applied.copy(), (slot_of(position, state), row, column)
     after[entry] = _clipped(operator, state)[entry]
-    for plane, volume, values in list(_changed_volumes(after, shape, operator, state)):
-        _follow_volume(plane, volume, values, 0, shape, operator, state)
+    for plane, volume, values in list(_changed_volumes(after, operator, state)):
+        _follow_volume(plane, volume, values, 0, operator, state)
     state.applied[:] = after
 
 
 # streamfeat.kernels.follow
 
 
-def follow(events, shape, operator, state):
+def follow(events, operator, state):
     for event in events.tolist():
-        follow_event(*event, shape, operator, state)
+        follow_event(*event, operator, state)
 
 
-def trace(events, shape, operator, state, features, accepted):
+def trace(events, operator, state, features, accepted):
     for i, event in enumerate(events.tolist()):
-        follow_event(*event, shape, operator, state)
+        follow_event(*event, operator, state)
         read_features(operator, state, features[i])
         accepted[i] = state.tally[TALLY_EVENTS]
 
 
-def follow_event(x, y, p, t, shape, operator, state):
-    n_volumes = shape[0] * shape[1]
+def follow_event(x, y, p, t, operator, state):
+    n_volumes = volumes_of(operator)
     position, row, column = count_event(x, y, p, t, operator, state)
     if state.cursors[int(state.clock[CLOCK_PLANE]), CURSOR_CODED] < n_volumes:
-        for part in range(2):
-            complete(part, shape, operator, state)
-        finish(shape, state)
+        fill_plane(operator, state)
     if position >= 0:
-        change_place(position, row, column, shape, operator, state)
+        change_place(position, row, column, operator, state)
     if len(state.cursors) == 2:
         share = float(np.clip((t - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
         goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])
@@ -771,7 +831,7 @@ def follow_event(x, y, p, t, shape, operator, state):
         coming = state.cursors[1 - int(state.clock[CLOCK_PLANE])]
         behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
         budget = 24 + 100 * int(behind) // n_volumes
-        look_ahead(projected, coded, budget, shape, operator, state)
+        look_ahead(projected, coded, budget, operator, state)
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

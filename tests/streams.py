@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 
 KINDS = [(f, e) for f in ("direct", "inverse") for e in ("soft", "split", "triangle")]
@@ -19,22 +19,6 @@ EXACT_KINDS = [kind for kind in KINDS if kind[0] == "direct" or kind[1] == "tria
 LASSO_KINDS = [kind for kind in KINDS if kind not in EXACT_KINDS]
 
 GAP = 1e-6
-
-
-def random_encoder(rng, geometry, n_filters, formulation="direct", encoding="soft", **parameters):
-    """An encoder like a learned one: filters of about unit length, whitening near the identity."""
-    d = geometry.entries
-    whitening = np.eye(d) + 0.2 / np.sqrt(d) * rng.normal(size=(d, d))
-    parameters = {"threshold": 0.1, "gap": GAP} | parameters
-    return Encoder.build(
-        geometry,
-        formulation=formulation,
-        encoding=encoding,
-        filters=rng.normal(size=(n_filters, d)) / np.sqrt(d),
-        whitening=(whitening + whitening.T) / 2,
-        mean=0.1 * rng.normal(size=d),
-        **parameters,
-    )
 
 
 @dataclass(frozen=True)
@@ -48,6 +32,7 @@ class Case:
     encoding: str
     threshold: float
     seed: int
+    threads: int = 1
 
     @cached_property
     def encoder(self):
@@ -57,7 +42,8 @@ class Case:
         )
 
     def engine(self, origin_us=0, *, look_ahead=False):
-        return Engine(self.encoder, self.resolution, origin_us=origin_us, look_ahead=look_ahead)
+        options = {"look_ahead": look_ahead, "threads": self.threads}
+        return Engine(self.encoder, self.resolution, origin_us=origin_us, **options)
 
 
 @st.composite
@@ -82,6 +68,7 @@ def cases(draw, kind, max_bins=4):
         encoding,
         draw(st.sampled_from([0.02, 0.3])),
         draw(st.integers(0, 1000)),
+        draw(st.sampled_from([1, 2, 3])),
     )
 
 

@@ -237,6 +237,23 @@ def test_a_program_that_takes_slowly_makes_the_pipeline_wait(idle):
         asyncio.run(main())
 
 
+def test_emissions_that_find_no_room_wait_until_the_program_takes():
+    sink, written = emission_stream._QueueSink(), threading.Event()
+    sink.write([None] * 500)
+
+    def write():
+        sink.write([None] * 13)
+        written.set()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert not written.wait(0.3)
+    assert len(asyncio.run(sink.take())) == 500
+    assert written.wait(30)
+    assert len(sink) == 13
+    writer.join()
+
+
 def test_stop_ends_the_source_and_what_was_read_comes_out():
     async def main():
         job, found = EndlessJob("1000ev"), []

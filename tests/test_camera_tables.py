@@ -134,6 +134,35 @@ def test_tables_as_people_write_them(tmp_path, name):
     )
 
 
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.decimals(0, 2_000_000_000, places=9).map(str)
+        | st.from_regex(r"[0-9]{1,9}\.[0-9]{0,8}", fullmatch=True),
+        min_size=1,
+        max_size=30,
+    ),
+    st.sampled_from([",", ";", " ", "\t", " ; "]),
+)
+def test_seconds_are_the_nearest_microseconds_of_the_floats_they_are(folder, times, separator):
+    times.sort(key=float)
+    data = "".join(separator.join([t, "3", "4", "1"]) + "\n" for t in times)
+    events = read(folder / "seconds.txt", data.encode(), columns="t,x,y,p", time_unit="s")
+    assert events["t"].tolist() == [int(np.rint(float(t) * 1e6)) for t in times]
+
+
+def test_plain_numbers_and_others_in_one_file(tmp_path):
+    """Blocks of plain numbers take another way than those with exponents, words or damage."""
+    rows = [f"{t},3,4,1" for t in range(400_000)]
+    rows[300_000] = "3e5,3,4,1"
+    rows.insert(200_000, "# again")
+    events = read(tmp_path / "a.csv", "\n".join(["t,x,y,p", *rows]).encode())
+    assert events["t"].tolist() == [*range(400_000)]
+    rows[350_000] = "350000,3,oh,1"
+    with pytest.raises(InputError, match="could not convert string 'oh'"):
+        read(tmp_path / "a.csv", "\n".join(["t,x,y,p", *rows]).encode())
+
+
 def test_seconds_and_their_rest_in_columns_of_their_own_are_refused(tmp_path):
     with pytest.raises(InputError, match="sec,usec,x,y,p lack one of"):
         read(tmp_path / "a.csv", b"sec,usec,x,y,p\n1,5,2,3,1\n")

@@ -451,3 +451,17 @@ def test_a_tie_goes_to_the_smaller_c():
     scores = trained.provenance["cross_validation"]
     assert len(set(scores.values())) == 1
     assert trained.provenance["C"] == 0.1
+
+
+def test_a_search_for_c_ends_where_larger_ones_are_no_better():
+    """Of equal scores the smaller C is the best so far; two in a row that are no better end the climb."""
+    asked = []
+
+    def score(c):
+        asked.append(round(np.log10(c)))
+        return 0.9
+
+    found = _climb(score, 1000)
+    assert asked[:3] == [asked[0], asked[0] + 1, asked[0] + 2]
+    assert max(asked) == asked[0] + 2
+    assert min(found) == 10.0 ** min(asked) < 10.0 ** asked[0]

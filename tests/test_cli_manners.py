@@ -91,6 +91,10 @@ REFUSED = [
     (["record", "a/*", "-o", "OUT", "--port", "-1"], "--port -1: there is no such port"),
     (["record", "a/*", "-o", "OUT", "--chunk", "nan"], "a chunk of nan s is not possible"),
     (["replay", DIGITS, "-m", MODEL, "--speed", "nan"], "--speed 'nan' is not understood"),
+    (["replay", DIGITS, "-m", MODEL, "--threads", "0"], "0 threads: an engine uses 1 to 256"),
+    (["listen", "a/*", "-m", MODEL, "--threads", "1000"], "1000 threads: an engine uses 1 to 256"),
+    (["view", DIGITS, "--no-open", "--threads", "-1"], "-1 threads: an engine uses 1 to 256"),
+    (["latency", DIGITS, "-m", MODEL, "--threads", "257"], "257 threads: an engine uses 1 to 256"),
     (["topics", "--seconds", "nan"], "--seconds nan"),
     (["topics", "--port", "65536"], "--port 65536: there is no such port"),
 ]

@@ -230,3 +230,17 @@ def test_predicting_does_not_wait_for_scikit_learn():
     loaded = set(done.stdout.split())
     assert "streamfeat.classify.classifier" in loaded
     assert not loaded & {"sklearn", "pandas", "bokeh", "pyarrow", "foxglove"}
+
+
+def test_a_pipe_gets_whole_values_on_one_line_each(tmp_path):
+    folder = tmp_path / ("a name that is longer than a line of eighty columns has room for " * 2)
+    folder.mkdir()
+    path = tiny.write_items(folder / "rec.mcap", tiny.labelled_items(12))
+    environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"}
+    told = subprocess.run([*COMMAND, "info", path], capture_output=True, text=True, env=environment)
+    rows = [line.split(maxsplit=1) for line in told.stdout.splitlines()[1:]]
+    assert [row[1].strip() for row in rows if row[0] == "file"] == [str(path)]
+    assert "…" not in told.stdout
+    names = [row[1].strip() for row in rows if row[0] == "topics"]
+    assert len(names) == 1
+    assert "messages), " in names[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import typer
+from test_json import check
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -53,6 +54,7 @@ def test_from_nothing_to_predictions_and_what_to_type_next(tmp_path):
 def test_as_json_without_lines():
     result = run("--json", "--folder", "it's/here")
     said = json.loads(result.stdout)
+    check("demo", said)
     assert (said["samples"], said["correct"]) == (4, round(said["accuracy"] * 4))
     assert [shlex.split(command)[0] for command in said["next"]] == ["streamfeat"] * 3
     assert "it's/here/test.mcap" in shlex.split(said["next"][0])

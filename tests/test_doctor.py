@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from test_json import check
 from typer.testing import CliRunner
 
 from streamfeat import cli
@@ -31,6 +32,7 @@ def test_a_sound_installation(requirements):
     requirements(*REAL)
     result = run("--json")
     found = json.loads(result.stdout)
+    check("doctor", found)
     assert (result.exit_code, found["problems"]) == (0, [])
     assert found["exact"] is True
     assert {"numpy", "numba", "mcap"} <= set(found["required"])

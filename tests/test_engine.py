@@ -1,15 +1,16 @@
 """The engine's contract: what it takes, what it refuses, what it hands out, and that it allocates nothing."""
 
+import os
 import sys
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from kernel_table import assert_certified
 from streams import EXACT_KINDS, KINDS, LASSO_KINDS, Case, random_events
 
-from streamfeat.engine import engine as engine_module
+from streamfeat.engine import threads
+from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine, EngineStats
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
@@ -502,7 +503,7 @@ def test_nothing_is_allocated_after_warm_up(kind):
         for batch in batches:
             engine.feed(batch)
             engine.advance(int(batch["t"][-1]) + case.geometry.bin_us)
-            update(engine.grid_shape, engine._operator, engine._state)
+            update(engine._operator, engine._state)
             engine.prepare(1000)
             engine.follow(batch[-20:])
 
@@ -529,17 +530,89 @@ def test_nothing_is_allocated_after_warm_up(kind):
 
 
 @pytest.mark.parametrize("look_ahead", [False, True])
-@pytest.mark.parametrize("kind", KINDS, ids=ids)
-def test_two_threads_give_what_one_gives(kind, look_ahead, monkeypatch):
-    monkeypatch.setattr(engine_module, "_WORTH_SPREADING", 0)
+@pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
+def test_any_number_of_threads_gives_what_one_gives(kind, look_ahead, monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_A_PART", 1)
     case = known_case(kind)
     events = some_events(case)
-    with ThreadPoolExecutor(2) as pool:
-        one = case.engine(look_ahead=look_ahead)
-        two = Engine(case.encoder, case.resolution, look_ahead=look_ahead, spread=pool.map)
-        for part in np.array_split(events, 7):
-            for engine in (one, two):
-                engine.feed(part)
-            np.testing.assert_array_equal(two.features(), one.features())
-            assert two.stats() == one.stats()
-        assert two.stats().encoded_volumes > 0
+    one = case.engine(look_ahead=look_ahead)
+    others = [Engine(case.encoder, case.resolution, look_ahead=look_ahead, threads=n) for n in (2, 3, 64)]
+    for part in np.array_split(events, 7):
+        one.feed(part)
+        one.prepare(60)
+        for engine in others:
+            engine.feed(part)
+            engine.prepare(60)
+            np.testing.assert_array_equal(engine.features(), one.features())
+            assert engine.stats() == one.stats()
+        one.follow(part[:3])
+        for engine in others:
+            engine.follow(part[:3])
+    assert one.stats().encoded_volumes > 0
+    for engine in others:
+        engine.restore(one.snapshot())
+        np.testing.assert_array_equal(engine.features(), one.features())
+        assert engine.stats() == one.stats()
+
+
+@pytest.mark.parametrize("n", [0, -1, 1000])
+def test_a_number_of_threads_that_makes_no_sense_is_refused(n):
+    case = known_case()
+    with pytest.raises(InputError, match=f"^{n} threads: an engine uses 1 to 256$"):
+        Engine(case.encoder, case.resolution, threads=n)
+
+
+def test_a_small_sensor_pays_nothing_for_threads(monkeypatch):
+    """It does all in one call, and starts no thread; the count of volumes decides, not the clock."""
+    monkeypatch.setattr(threads.Crew, "share", None)
+    case = known_case()
+    engine = Engine(case.encoder, case.resolution, threads=2)
+    engine.feed(some_events(case))
+    assert engine.features().any()
+    volumes = engine.grid_shape[0] * engine.grid_shape[1]
+    monkeypatch.setattr(threads, "WORTH_A_PART", 64 * volumes // 2)
+    engine.restart(0)
+    engine.feed(some_events(case))
+    with pytest.raises(TypeError):
+        engine.features()
+
+
+def test_cores_but_one_are_used_if_nothing_is_said(monkeypatch):
+    for cores, used in ((1, 1), (2, 1), (3, 2), (1000, 256)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda pid, n=cores: set(range(n)), raising=False)
+        assert threads.usable_threads() == used
+
+
+@pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)
+def test_an_engine_that_looked_ahead_goes_on_after_a_snapshot_as_one_that_is_restored(kind):
+    """Codes of the plane that looks ahead are where the next ones start: a snapshot forgets them."""
+    case = known_case(kind)
+    for seed in range(4):
+        engine, other = case.engine(look_ahead=True), case.engine(look_ahead=True)
+        events = some_events(case, seed=seed)
+        first, second = np.split(events, [150])
+        for batch in np.array_split(first, 5):
+            engine.feed(batch)
+            engine.prepare(10**6)
+        other.restore(engine.snapshot())
+        for batch in np.array_split(second, 5):
+            for each in (engine, other):
+                each.feed(batch)
+                each.prepare(10**6)
+            np.testing.assert_array_equal(engine.features(), other.features())
+            np.testing.assert_array_equal(engine.codes(), other.codes())
+
+
+def test_the_grid_of_a_sensor_is_no_part_of_a_fingerprint():
+    """Classifiers and checkpoints name encoders by their fingerprint: it may not change with a version."""
+    geometry = Geometry(patch=2, stride=1, n_bins=1, bin_us=10)
+    encoder = Encoder.build(
+        geometry,
+        formulation="direct",
+        encoding="soft",
+        threshold=0.5,
+        filters=np.eye(4),
+        whitening=np.eye(4),
+        mean=np.zeros(4),
+    )
+    assert encoder.fingerprint == "14986669249bf443458611d0143b0af5e350252030d39e783ad9dca1094ead28"

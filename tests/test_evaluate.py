@@ -171,6 +171,8 @@ def test_on_train_what_is_held_out_is_not_there(animals, tmp_path):
 
 def test_of_a_packet_only_the_events_of_a_held_out_sample_are_left_out(tmp_path):
     events = tiny.steady(0, 30_000, 90)
+    events["t"][[30, 60]] = 10_000, 20_000  # the first that is left out, and the first that is not
+    events.sort(order="t")
     items = [
         Label(0, 10_000, "cat", "train"),
         Label(10_000, 10_000, "dog", "test"),

@@ -41,7 +41,11 @@ def test_every_kind_is_read_again_event_for_event(source, tmp_path, ending):
     found, resolution = read(tmp_path / f"out{ending}", ReadOptions(resolution=SIZE))
     np.testing.assert_array_equal(found, stream())
     assert resolution == SIZE
-    assert done.result() == {"events": 30_000, "bytes_out": (tmp_path / f"out{ending}").stat().st_size}
+    size = (tmp_path / f"out{ending}").stat().st_size
+    assert {name: value for name, value in done.result().items() if value} == {
+        "events": 30_000,
+        "bytes_out": size,
+    }
 
 
 @pytest.mark.parametrize("ending", [".raw", ".h5", ".mcap"])
@@ -256,7 +260,7 @@ def test_the_command(run, source, tmp_path):
     result = run(
         "convert", source, tmp_path / "out.raw", "--crop", "0,0,8,8", "--refractory", "100ms", "--json"
     )
-    assert result.json["refractory"] > 0
+    assert result.json["removed"]["refractory"] > 0
     assert run("info", tmp_path / "out.raw", "--json").json["events"] == result.json["events"]
     csv = run("convert", source, tmp_path / "out.csv", "--json")
     assert csv.status == 0

@@ -79,6 +79,7 @@ ONLY_IN = {
     "foxglove": {"view"},
     "websockets": {"view"},
     "numba": {"kernels", "latency", "cli"},
+    "llvmlite": {"kernels", "cli"},
 }
 """The rooms that may import a library."""
 
@@ -190,7 +191,8 @@ def test_a_library_is_imported_where_it_belongs(library):
 def test_kernels_know_nothing_but_arrays(name):
     outside = {i.partition(".")[0] for i in imports_of(NAMES[name])} - {"streamfeat"}
     if name not in COMPILING:
-        assert outside <= {"math", "numpy", "numba", "typing"}
+        more = {"llvmlite"} if name == "kernels.vectors" else set()
+        assert outside <= {"math", "numpy", "numba", "typing"} | more
     assert {i.partition(".")[0] for i in own_imports(NAMES[name])} <= {"kernels", "events"}
 
 
@@ -231,12 +233,21 @@ def test_nothing_in_a_module_can_run_what_it_reads_or_reorder_floats(name):
             )
 
 
-@pytest.mark.parametrize("name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING))
+@pytest.mark.parametrize(
+    "name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING - {"kernels.vectors"})
+)
 def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
         if isinstance(node, ast.FunctionDef):
             (decorator,) = node.decorator_list
             assert decorator.id in {"kernel", "inlined", "allocating"}
+
+
+def test_vector_code_is_generated_in_one_module_and_in_one_way():
+    """`kernels.vectors` offers functions that write machine code, and no others."""
+    functions = [node for node in tree_of(NAMES["kernels.vectors"]).body if isinstance(node, ast.FunctionDef)]
+    generated = {f.name for f in functions if [ast.unparse(d) for d in f.decorator_list] == ["generated"]}
+    assert generated == set(importlib.import_module("streamfeat.kernels.vectors").__all__)
 
 
 @modules(packages=True)

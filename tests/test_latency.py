@@ -198,10 +198,10 @@ def test_a_policy_is_fed_and_read_as_a_session_does(emit):
     found = feed_and_read(encoder, items, EmitPolicy.parse(emit), warm_up=0)
     assert found.batch_events.sum() == n_events(items)
     assert (found.batch_ns > 0).all()
-    assert (found.reading_ns > 0).all()
+    assert (found.emission_ns > 0).all()
     if emit != "auto":  # which depends on the clock
         session = Session(encoder, EmitPolicy.parse(emit))
-        assert len(found.reading_ns) == sum(len(list(session.process(item))) for item in items)
+        assert len(found.emission_ns) == sum(len(list(session.process(item))) for item in items)
     later = feed_and_read(encoder, items, EmitPolicy.parse(emit), warm_up=n_events(items) - 10)
     assert 10 <= later.batch_events.sum() < n_events(items)
 
@@ -221,7 +221,7 @@ def test_a_hop_counts_each_emission_once(emit):
         MODEL, items, EmitPolicy.parse(emit), speed=20.0, look_ahead=True, warm_up=items[:2]
     )
     session = Session(MODEL, EmitPolicy.parse(emit))
-    # Nothing comes after the last sample to end it, so its final reading is not part of the stream.
+    # Nothing comes after the last sample to end it, so its final emission is not part of the stream.
     expected = sum(
         len(list(session.process(item))) for item in without_silence(items, MODEL.geometry.window_us)
     )
@@ -234,7 +234,7 @@ def test_a_hop_counts_each_emission_once(emit):
 
 
 def test_a_hop_says_how_far_it_falls_behind():
-    # One second of the stream in a millisecond: everything is due at once, and the last reading waits
+    # One second of the stream in a millisecond: everything is due at once, and the last emission waits
     # for all others.
     items = [tiny.packet(tiny.steady(0, 1_000_000, 20_000))]
     took = measure_end_to_end(MODEL, items, EmitPolicy.parse("event"), speed=1000.0, look_ahead=True)
@@ -367,7 +367,7 @@ def test_a_row_for_each_model_policy_and_part(run, home):
         (model, emit, what)
         for model in ("direct", "inverse")
         for emit in ("event", "10ms", "auto")
-        for what in parts.get(emit, ["ingest", "reading", "end to end"])
+        for what in parts.get(emit, ["ingest", "emission", "end to end"])
     ]
     assert [(row["model"], row["emit"], row["what"]) for row in said["rows"]] == expected
     assert (status, said["interrupted"], said["warm_up_events"]) == (0, False, 500)
@@ -490,7 +490,7 @@ def test_an_interrupted_measurement_shows_what_it_has(home):
     assert said["interrupted"]
     assert [(row["emit"], row["what"]) for row in said["rows"]][:2] == [
         ("10ms", "ingest"),
-        ("10ms", "reading"),
+        ("10ms", "emission"),
     ]
     assert {row["emit"] for row in said["rows"]} == {"10ms"}
     assert all(row["n"] for row in said["rows"])

@@ -19,6 +19,7 @@ from streamfeat.learn.fit import geometry_of, learn_encoder
 from streamfeat.learn.settings import DEFAULTS, PRESETS, THRESHOLD, Setting, preset_with
 from streamfeat.learn.volumes import Volumes, Window, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
+from streamfeat.messages.packets import PacketReader
 from streamfeat.recordings.reader import Label, open_recording
 
 D = 12
@@ -443,3 +444,30 @@ def test_a_geometry_has_every_value_of_a_setting_that_it_knows():
     changed = {"patch": 5, "stride": 3, "downsample": 2, "max_count": 9}
     geometry = geometry_of(Setting(**changed), [])
     assert {name: getattr(geometry, name) for name in changed} == changed
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """Log times of the packets that are decoded."""
+    times, decode = [], PacketReader.read
+    monkeypatch.setattr(PacketReader, "read", lambda *given: times.append(given[3]) or decode(*given))
+    return times
+
+
+@pytest.mark.parametrize(("window_ms", "opened"), [(None, 2), (100.0, 1)])
+@pytest.mark.parametrize("labelled", [True, False])
+def test_each_packet_is_decoded_once_also_when_going_on(labelled, window_ms, opened, tmp_path, decoded):
+    items = [item for item in tiny.labelled_items(5) if labelled or not isinstance(item, Label)]
+    with open_recording(tiny.write_items(tmp_path / "b.mcap", items)) as recording:
+        for resume in (None, learn(recording, window_ms=window_ms)):
+            decoded.clear()
+            learn(recording, window_ms=window_ms, resume=resume)
+            assert len(decoded) == 10 + opened  # the first says how large the sensor is
+
+
+def test_labels_are_known_without_their_events(tmp_path, decoded):
+    items = tiny.labelled_items(5)
+    with open_recording(tiny.write_items(tmp_path / "b.mcap", items)) as recording:
+        decoded.clear()
+        assert [*recording.stored_labels()] == [item for item in items if isinstance(item, Label)]
+        assert decoded == []

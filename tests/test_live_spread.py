@@ -13,6 +13,9 @@ from test_live_listen import MODEL, message
 
 pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
+from test_json import check
+
+from streamfeat.cli.results import complete
 from streamfeat.live.cluster import ClusterListen, ServedCamera
 from streamfeat.live.names import PlainNames, RosNames
 from streamfeat.live.network import Network, TopicWatch, open_session
@@ -102,6 +105,7 @@ def test_cameras_of_a_worker_that_dies_are_served_again(two, model, tmp_path, ke
             lambda: [counted(job.result()["of_each"][key]) for key in keys] == sent, lambda: f"{job.result()}"
         )
     result = job.result()
+    check("listen --cluster", complete("listen --cluster", result))
     assert (result["cameras"], result["restarts"]) == (4, len(mourned))
     assert [counted(result["of_each"][key]) for key in keys] == sent
     for key in keys:

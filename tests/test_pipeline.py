@@ -15,7 +15,7 @@ import tiny
 from streamfeat.errors import InputError
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.replay import ReplayJob, parse_speed
@@ -382,7 +382,7 @@ def test_progress_is_told_in_order(digits):
 
 @pytest.mark.real_time
 def test_the_recorded_pace_is_kept():
-    # One packet of 400 ms at twice its pace; it is cut, so that readings do not wait for its end.
+    # One packet of 400 ms at twice its pace; it is cut, so that emissions do not wait for its end.
     sink = ListSink()
     arrived = []
     write = sink.write
@@ -465,7 +465,36 @@ def test_the_terminal_without_labels():
         clock[0] = i / 10
         sink.write(plain_loop([tiny.packet(tiny.stream([i]))], "event")[0])
     sink.close(failed=False)
-    assert len(screen.lines) == 3
+    assert len(screen.lines) == 10
+
+
+def test_a_line_without_labels_says_rate_active_volumes_and_what_moved():
+    screen, clock = Screen(), [0.0]
+    sink = TerminalSink(screen, clock=lambda: clock[0], n_filters=3)
+    since_1970_us = 1_744_227_144_000_000
+    features = [[1, 0, 0, 0, 0, 0], [1, 0, 4, 0, -2, 0], [1, 0, 4, 0, -2, 0]]
+    for i, row in enumerate(features):
+        clock[0] = float(i)
+        sink.write(
+            [
+                Emission(
+                    since_1970_us + i * 500_000,
+                    i * 12_345,
+                    np.array(row, np.float32),
+                    (),
+                    np.zeros(0, np.float32),
+                    None,
+                    False,
+                    active_volumes=1_204,
+                )
+            ]
+        )
+    assert [" ".join(line.split()) for line in screen.lines] == [
+        "0.00 s -/s 1,204 active filters 1+",
+        "0.50 s 24.7k/s 1,204 active filters 3+ 2-",
+        "1.00 s 24.7k/s 1,204 active filters at rest",
+    ]
+    assert max(map(len, screen.lines)) <= 60
 
 
 # --- replay

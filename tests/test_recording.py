@@ -655,3 +655,42 @@ def test_played_again_labels_move_with_their_events(tmp_path):
     assert starts[0] == 100
     assert starts[1] > events[0]
     assert [event - start for start, event in zip(starts, events, strict=True)] == [10, 10, 10]
+
+
+def chunks_of(data):
+    """Start and end of every chunk of an undamaged file."""
+    at = 8
+    while data[at] != 2:  # the footer
+        (length,) = struct.unpack_from("<Q", data, at + 1)
+        if data[at] == 6:
+            yield at, at + 9 + length
+        at += 9 + length
+
+
+def file_of_chunks(path, messages):
+    """A file of one uncompressed chunk for each message."""
+    writer = Writer(str(path), chunk_size=1, compression=CompressionType.NONE)
+    writer.start("", "")
+    channel = writer.register_channel("/a", "cdr", writer.register_schema("a/A", "ros2msg", b""))
+    for i, message in enumerate(messages):
+        writer.add_message(channel, i, message, i)
+    writer.finish()
+    return bytearray(path.read_bytes())
+
+
+def test_a_chunk_inside_a_good_chunk_is_not_found_when_what_comes_after_is_damaged(tmp_path):
+    """Recordings of recorders hold chunks as data: after a good chunk the search goes on behind it."""
+    inner = file_of_chunks(tmp_path / "inner.mcap", [b"in the data"])
+    ((start, end),) = chunks_of(inner)
+    messages = [bytes(inner[start:end]), b"second", b"third"]
+    data = file_of_chunks(tmp_path / "outer.mcap", messages)
+    first, second, _ = chunks_of(data)
+    damaged = tmp_path / "damaged.mcap"
+    data[first[1]] = 0  # no type of a record
+    damaged.write_bytes(data)
+    losses = mcap_records.Losses()
+    with mcap_records.open_mcap(damaged) as file:
+        found = [r.data for _, r in mcap_records.iter_records(file, losses) if hasattr(r, "log_time")]
+    assert list(map(bytes, found)) == messages
+    assert losses.counts == {"damaged record": 1}
+    assert losses.bytes == {"damaged record": second[0] - first[1]}

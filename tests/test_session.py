@@ -8,6 +8,7 @@ import tiny
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures, encode_samples, sample_end
+from streamfeat.engine import threads
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
@@ -65,10 +66,21 @@ def cut(items, rng):
         ("500us", "time", 500),
         ("2s", "time", 2_000_000),
         ("auto", "auto", 1),
+        ("bin", "bin", 1),
     ],
 )
 def test_policies_are_parsed(text, kind, every):
     assert EmitPolicy.parse(text) == EmitPolicy(kind, every)
+    assert EmitPolicy.parse(str(EmitPolicy(kind, every))) == EmitPolicy(kind, every)
+
+
+def test_at_every_bin_is_at_every_multiple_of_its_length():
+    items = tiny.labelled_items(3)
+    policies = ("bin", f"{tiny.GEOMETRY.bin_us}us")
+    bins, times = (run(items, policy)[0] for policy in policies)
+    assert [(e.t_us, e.features.tobytes()) for e in bins] == [(e.t_us, e.features.tobytes()) for e in times]
+    assert len(bins) == 6
+    assert all(e.active_volumes > 0 for e in bins if e.final)
 
 
 @pytest.mark.parametrize(
@@ -553,3 +565,17 @@ def test_a_session_that_emits_as_often_as_it_can_does_not_look_ahead():
     resting.clock.now += 100.0
     resting.session.rest()
     assert resting.asked == []
+
+
+@pytest.mark.parametrize("policy", ["10ms", "auto"])
+def test_any_number_of_threads_makes_the_same_emissions(policy, monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_A_PART", 1)
+    items = [
+        tiny.packet(tiny.steady(start, start + 50_000, 2000, seed=start)) for start in (0, 50_000, 100_000)
+    ]
+    one, _ = run(items, policy)
+    three, session = run(items, policy, threads=3)
+    assert session._engine._crew.threads == 3
+    assert [e.t_us for e in three] == [e.t_us for e in one]
+    for mine, yours in zip(three, one, strict=True):
+        np.testing.assert_array_equal(mine.features, yours.features)

@@ -231,7 +231,7 @@ def test_readings_between_events_and_silences_do_not_go_back():
 
 
 def test_a_file_never_says_more_than_was_written(tmp_path):
-    """Readings that no sink has taken yet are made again."""
+    """Emissions that no sink has taken yet are made again."""
     path = tmp_path / "state"
     job = Job(path)
     packets = [tiny.packet(events) for events in batches(8)]

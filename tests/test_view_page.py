@@ -255,7 +255,7 @@ def test_events_alone_fill_the_page_and_can_be_steered(tab, tmp_path):
         tab.open(next(line.partition(": ")[2] for line in lines if line.startswith("page")))
         tab.until("typeof model !== 'undefined'")
         player = f"({LAST}).player"
-        tab.until(f"({player})?.ended && ({LAST}).timeline?.done")
+        tab.until(f"typeof model == 'object' && ({player})?.ended && ({LAST}).timeline?.done")
         assert tab.value("getComputedStyle(document.querySelector('.features')).display") == "none"
         assert tab.value(f"({LAST}).timeline.counts.reduce((a, b) => a + b)") == 3_000
         tab.value("stream.ask('pause', { value: true }); seek(0.5); 0")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from streamfeat.classify.classifier import Classifier
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.learn.volumes import sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
@@ -20,18 +20,7 @@ RESOLUTION = (12, 16)
 
 def encoder(formulation="direct", encoding="split", *, k=5, geometry=GEOMETRY, seed=0):
     """An encoder of random filters."""
-    rng = np.random.default_rng(seed)
-    d = geometry.entries
-    filters = rng.standard_normal((k, d))
-    return Encoder.build(
-        geometry,
-        formulation=formulation,
-        encoding=encoding,
-        threshold=0.3,
-        filters=filters / np.linalg.norm(filters, axis=1, keepdims=True),
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
+    return random_encoder(seed, geometry, k, formulation, encoding, threshold=0.3, whitening=0.0)
 
 
 def classifier(model, labels=("cat", "dog", "owl"), seed=0):

@@ -266,7 +266,7 @@ class Rows:
             columns: t, x, y, p, each `(n,)` numbers, not changed.
 
         Raises:
-            InputError: a value is none that an event can have.
+            InputError: a value is out of the range that events have.
         """
         columns = {name: _exact(column) for name, column in columns.items()}
         t = _microseconds(columns["t"], self._unit)

@@ -109,13 +109,13 @@ def _ecf_columns(frame: bytes) -> list[NDArray[Any]]:
 
 
 def _frames(path: Path, stream: str | None) -> Iterator[tuple[bytes, bytes]]:
-    """What the other process tells, but for how it ended.
+    """Frames from the other process, without the last, which tells how it ended.
 
     Raises:
         InputError: it refuses the file.
         _DamageError: the library gave up, or did not come to an end.
     """
-    # -P: the folder that somebody works in is no place to import from.
+    # -P: modules are not imported from the working directory.
     command = [
         sys.executable,
         "-P",
@@ -139,5 +139,5 @@ def _frames(path: Path, stream: str | None) -> Iterator[tuple[bytes, bytes]]:
                     raise _DamageError(one_line(ValueError(data.decode())))
                 yield kind, data
         finally:
-            process.kill()  # nobody reads on
+            process.kill()  # its output is not read any further
         raise _DamageError("the HDF5 library does not come to an end, or fails")

@@ -56,7 +56,7 @@ FORMATS = {
     "numpy": ".npz or .npy (columns or fields x, y, p, t)",
     "text": "text .txt/.csv/.tsv (t x y p)",
 }
-"""What can be read, by the name that `open_events` takes."""
+"""Formats that can be read, by the name that `open_events` takes."""
 
 EXTENSIONS = frozenset(
     [

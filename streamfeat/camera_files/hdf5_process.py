@@ -215,7 +215,7 @@ def _about(
 def _check(h5py: Any, root: Any, dataset: Any) -> None:
     """Refuse a dataset that is not in this file, whose codec is missing, or that claims too much.
 
-    A dataset may say that its bytes are in any other file, and claim any number of rows that nobody wrote.
+    A dataset may say that its bytes are in any other file, and claim rows that were never written.
     """
     if dataset.external or dataset.is_virtual or dataset.file.filename != root.filename:
         raise InputError("keeps its events in another file; convert that one")

@@ -137,5 +137,5 @@ def chosen_stream(path: object, streams: tuple[str, ...], wanted: str | None) ->
 
 
 def one_line(error: BaseException) -> str:
-    """What a library says, however many lines it takes, as part of a one-line message."""
+    """The message of a library, of any number of lines, as part of a one-line message."""
     return " ".join(str(error).split())[:200]

@@ -27,9 +27,11 @@ from streamfeat.camera_files.source import (
 )
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
+from streamfeat.kernels.file_codes import parse_rows
 
 __all__ = ["open_text"]
 
+_POWERS = np.array([float(10**n) for n in range(19)])
 _HEADER_LINES = 1_000  # before the first event
 _TRUE = re.compile(r"(?i)\b(?:true|on|pos(?:itive)?)\b")
 _FALSE = re.compile(r"(?i)\b(?:false|off|neg(?:ative)?)\b")
@@ -181,14 +183,39 @@ def _columns(
     return [rows[name] for name in dtype.names or ()]
 
 
+def _plain_columns(block: bytes, form: _Form, wanted: list[int]) -> list[NDArray[Any]] | None:
+    """The wanted columns where all are plain decimal numbers, None where something else is in them.
+
+    A float is what its digits and a power of ten make, both of which are exact: the nearest one.
+    """
+    if form.has_words or form.has_notes or form.has_decimal_commas:
+        return None
+    text = np.frombuffer(block.removeprefix(b"\xef\xbb\xbf") + b"\n", np.uint8).copy()
+    digits, decimals = np.empty((2, len(wanted), block.count(b"\n") + 1), np.int64)
+    separator = ord(form.separator) if form.separator else 0
+    n = parse_rows(text, separator, np.array(wanted), digits, decimals)
+    if n <= 0:
+        return None
+    return [
+        column[:n] / _POWERS[points[:n]] if points[:n].any() else column[:n]
+        for column, points in zip(digits, decimals, strict=True)
+    ]
+
+
 def _read(path: Path, form: _Form, layout: Layout, losses: Losses) -> Iterator[Events]:
     """Lines of events, in blocks; half a line at the end is counted as lost."""
     rows = Rows(path, layout.unit)
     wanted = sorted(layout.order)
 
-    def events(lines: list[str]) -> Events:
-        found = dict(zip(wanted, _columns(path, rows.n, lines, form, wanted), strict=True))
-        return rows.events({field: found[i] for field, i in zip("txyp", layout.order, strict=True)})
+    def events(block: bytes) -> Events | None:
+        found = _plain_columns(block, form, wanted)
+        if found is None:
+            lines = [line for line in _lines(block) if not _is_comment(line)]
+            if not lines:
+                return None
+            found = _columns(path, rows.n, lines, form, wanted)
+        named = dict(zip(wanted, found, strict=True))
+        return rows.events({field: named[i] for field, i in zip("txyp", layout.order, strict=True)})
 
     with path.open("rb") as raw:
         skip, rest = form.skip, b""
@@ -198,14 +225,18 @@ def _read(path: Path, form: _Form, layout: Layout, losses: Losses) -> Iterator[E
                 raise InputError(
                     f"{path}: byte {raw.tell() - len(rest)}: no end of line; this is not event text"
                 )
-            lines = [line for line in _lines(whole) if not _is_comment(line)]
-            lines, skip = lines[skip:], max(0, skip - len(lines))
-            if lines:
-                yield events(lines)
+            start = 0
+            while skip and start < len(whole):
+                end = whole.find(b"\n", start)
+                end = end if end >= 0 else len(whole)
+                skip -= not _is_comment("".join(_lines(whole[start:end])))
+                start = end + 1
+            if (batch := events(whole[start:])) is not None:
+                yield batch
         last = "".join(_lines(rest))
         if _is_comment(last):
             return
         if len(_split(last, form.separator)) <= max(layout.order):
             losses.lose(len(rest), f"{len(rest)} bytes at byte {raw.tell() - len(rest)} are not a whole line")
-        else:
-            yield events([last])
+        elif (batch := events(rest)) is not None:
+            yield batch

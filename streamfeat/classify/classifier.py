@@ -96,7 +96,7 @@ class Classifier(Shown):
 
     @property
     def linear(self) -> "Classifier":
-        """Itself: what can learn online and keep pace with single events."""
+        """The classifier itself, which can learn online and keep pace with single events."""
         return self
 
     @classmethod

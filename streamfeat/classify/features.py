@@ -81,7 +81,7 @@ class EncodedSamples:
     Attributes:
         rows: `(n, F)` float32.
         labels: `(n,)` names.
-        sources: `(n,)` texts, what the labels say that samples are from.
+        sources: `(n,)` texts, the sources of the samples according to their labels.
         held_out: `(n,)` bool, whether a sample is of a held-out split.
     """
 
@@ -145,7 +145,7 @@ def _encode_part(
 def training_set(
     samples: EncodedSamples, others: Sequence[EncodedSamples] = ()
 ) -> tuple[NDArray[np.float32], list[str], NDArray[np.int64]]:
-    """What a classifier is trained on: rows, labels, and the number of the sample that each is made of.
+    """Rows to train a classifier on, their labels, and the number of each row's sample.
 
     Args:
         samples: of which those that are not held out are taken.
@@ -198,7 +198,7 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                 `(height, width)`.
 
         Raises:
-            InputError: one of them is none of these, or an array has no resolution.
+            InputError: one of them is of another type, or an array has no resolution.
         """
         rows = list(_mapped(self._encode, enumerate(X), self.threads))
         return np.stack(rows) if rows else np.zeros((0, self.encoder.n_features), np.float32)

@@ -12,13 +12,24 @@ from typing import NoReturn
 
 from rich.markup import escape
 
-from streamfeat.cli import evaluating, learning, live, measuring, recordings, starting, streaming, viewing
+from streamfeat.cli import (
+    evaluating,
+    labelling,
+    learning,
+    live,
+    measuring,
+    recordings,
+    starting,
+    streaming,
+    viewing,
+)
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
 __all__ = [
     "app",
     "evaluating",
+    "labelling",
     "learning",
     "live",
     "main",

@@ -4,7 +4,6 @@ Lives here: its arguments, and how its result is shown.
 Not here: the evaluation (`streamfeat.evaluate`).
 """
 
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
     working,
@@ -187,7 +187,7 @@ def evaluate(
     if output:
         save_result(output, result)
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json("evaluate", result)
     else:
         _print(result)
 

@@ -1,4 +1,4 @@
-"""What this installation is, what it lacks, and whether it computes what it should, how fast.
+"""The state of this installation: versions, missing extras, exactness and speed.
 
 Lives here: versions against what the package asks for, extras, threads, kernels, a second of work.
 Not here: measurements that figures are quoted from (`latency`), and how the result is shown (`cli`).
@@ -15,9 +15,9 @@ import numpy as np
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events
 from streamfeat.kernels import cache
 from streamfeat.report.machine import Disturbance, describe_machine
@@ -38,10 +38,13 @@ EXTRAS = {
     "test": "the tests",
     "lint": "lint and types",
 }
-"""What each extra is for."""
+"""The purpose of each extra."""
 
 _VECTORS = ("sse4.2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "neon", "sve")
 _FILTERS = 400
+_GEOMETRY = Geometry(patch=12, stride=4, n_bins=3, bin_us=100_000, max_count=1)
+"""The default of `streamfeat learn`."""
+
 _SAMPLE_US = 1_000_000
 
 
@@ -132,7 +135,8 @@ def _satisfies(found: str, wanted: str) -> bool:
 def _work(progress: Callable[[str], None], seconds: float) -> dict[str, Any]:
     """Encode simulated digits both ways; then as many events as fit into the time."""
     progress("compiling kernels, if this is the first time")
-    encoder, events, resolution = _random_encoder(), _digit_events(), CameraModel().resolution
+    events, resolution = _digit_events(), CameraModel().resolution
+    encoder = random_encoder(0, _GEOMETRY, _FILTERS, encoding="split", threshold=0.3)
     started = time.perf_counter()
     feeding, following = Engine(encoder, resolution), Engine(encoder, resolution)
     feeding.feed(events)
@@ -177,21 +181,3 @@ def _events_per_second(take: Callable[[Events], None], events: Events, seconds: 
 
 def _digit_events() -> Events:
     return next(iter(digit_samples(1, 0))).events
-
-
-def _random_encoder() -> Encoder:
-    """The default geometry of `streamfeat learn`, with filters that need no learning."""
-    geometry, rng = (
-        Geometry(patch=12, stride=4, n_bins=3, bin_us=100_000, max_count=1),
-        np.random.default_rng(0),
-    )
-    filters = rng.standard_normal((_FILTERS, geometry.entries))
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.3,
-        filters=filters / np.linalg.norm(filters, axis=1, keepdims=True),
-        whitening=np.eye(geometry.entries),
-        mean=np.zeros(geometry.entries),
-    )

@@ -140,7 +140,7 @@ def learn(
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
-        "objective": f"{encoder.provenance['objective'][0]} to {encoder.provenance['objective'][-1]}",
+        "objective": [encoder.provenance["objective"][0], encoder.provenance["objective"][-1]],
         "condition": encoder.provenance["condition"][-1],
         "coherence": encoder.provenance["coherence"][-1],
         "unused": encoder.provenance["unused"],
@@ -148,10 +148,8 @@ def learn(
     }
     entries = encoder.geometry.entries
     if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:
-        result["log_determinant"] = (
-            f"that of A XX' A': {encoder.n_filters} filters are fewer than {entries} entries"
-        )
-    print_result(result, "learned", as_json=as_json)
+        result["log_determinant"] = "A XX' A'"
+    print_result(result, "learned", as_json=as_json, command="learn")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)
@@ -268,7 +266,7 @@ def train(
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
-        "labels": ", ".join(trained.labels),
+        "labels": list(trained.labels),
         "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),
         "C": trained.provenance["C"],
@@ -282,7 +280,7 @@ def train(
         if known.any():
             places = np.searchsorted(found.labels, true[known])
             result["held_out_calibration_error"] = round(calibration_error(likely[known], places), 4)
-    print_result(result, "trained", as_json=as_json)
+    print_result(result, "trained", as_json=as_json, command="train")
     for rec in opened:
         print_removed(rec.losses)
         print_losses(rec.losses)

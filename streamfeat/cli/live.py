@@ -20,6 +20,7 @@ from streamfeat.cli.program import (
     OverwriteOption,
     QuietOption,
     SpeedOption,
+    ThreadsOption,
     TopicOption,
     VerboseOption,
     WorkersOption,
@@ -28,6 +29,7 @@ from streamfeat.cli.program import (
     err,
     model_or_general,
     out,
+    print_json,
     print_losses,
     print_result,
     progress_bars,
@@ -134,6 +136,7 @@ def listen(
             help="Hear only cameras with a liveliness token; packets of others are not sent here.",
         ),
     ] = False,
+    threads: ThreadsOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
     zenoh_config: ConfigOption = None,
@@ -161,6 +164,7 @@ def listen(
         "network": Network(zenoh_config, port, reliable),
         "max_delay_s": max_delay,
         "state": state,
+        "threads": threads,
     }
     if cluster is not None or workers is not None:
         if output or json_lines or table or metrics or shard or announced:
@@ -168,6 +172,7 @@ def listen(
                 "on a cluster cameras need no --shard and no --announced, and features and predictions go to "
                 "the network: leave out --output, --json-lines, --table and --metrics, or use `record`"
             )
+        common["threads"] = 1 if threads is None else threads  # its workers are as many as there are cores
         _spread(names, chosen, classifier, common, cluster, workers, quiet=quiet, as_json=as_json)
         return
     share = Shard.parse(shard) if shard is not None else None
@@ -186,7 +191,7 @@ def listen(
         )
     )
     if not to_terminal:
-        print_result(job.result(), "heard", as_json=as_json)
+        print_result(job.result(), "heard", as_json=as_json, command="listen")
 
 
 def _spread(
@@ -208,10 +213,7 @@ def _spread(
         job = ClusterListen(names, place, model, classifier, say=say, **common)  # type: ignore[arg-type]
         job.run()
     result = job.result()
-    of_each = result.pop("of_each")
-    if as_json:
-        result["of_each"] = of_each
-    print_result(result, names.expression, as_json=as_json)
+    print_result(result, names.expression, as_json=as_json, command="listen --cluster")
 
 
 @app.command(epilog="Example: streamfeat publish recordings/digits_test.mcap robot/cam0/events --loop")
@@ -266,7 +268,7 @@ def publish(
     print_assumptions(job.assumptions)
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "published", as_json=as_json)
+    print_result(job.result(), "published", as_json=as_json, command="publish")
 
 
 @app.command(epilog="Example: streamfeat record 'robot/*/events' -o drive.mcap")
@@ -303,7 +305,7 @@ def record(
     )
     with progress_bars(quiet=quiet) as report:
         job.run(report)
-    print_result(job.result(), "recorded", as_json=as_json)
+    print_result(job.result(), "recorded", as_json=as_json, command="record")
 
 
 @app.command(epilog="Example: streamfeat recover drive.mcap.part drive.mcap")
@@ -323,7 +325,7 @@ def recover(
     with progress_bars(quiet=quiet) as report:
         losses = recover_recording(source, target, overwrite=overwrite, report=report)
     result = {"written": str(target), "lost": sum(losses.counts.values()), "reasons": dict(losses.counts)}
-    print_result(result, "recovered", as_json=as_json)
+    print_result(result, "recovered", as_json=as_json, command="recover")
     print_losses(losses)
 
 
@@ -344,7 +346,7 @@ def topics(
     with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
     if as_json:
-        print_result({"topics": [asdict(topic) for topic in found]}, "", as_json=True)
+        print_json("topics", {"topics": [asdict(topic) for topic in found]})
         return
     for topic in found:
         where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"

@@ -5,7 +5,6 @@ Not here: the measurements (`latency`).
 """
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,12 +21,14 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     StepsOption,
+    ThreadsOption,
     TopicOption,
     app,
     completing,
     err,
     model_or_general,
     out,
+    print_json,
     progress_bars,
     refuse_existing,
 )
@@ -82,6 +83,7 @@ def latency(
         Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
     ] = None,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: StepsOption = False,
@@ -106,6 +108,7 @@ def latency(
         seconds=seconds,
         speed=speed,
         look_ahead=look_ahead,
+        threads=threads,
     )
     print_assumptions(report.assumptions)
     try:
@@ -118,7 +121,7 @@ def latency(
     except KeyboardInterrupt:  # before there is anything to show, or for the second time
         raise typer.Exit(130) from None
     if as_json:
-        typer.echo(json.dumps(report.result()))
+        print_json("latency", report.result())
     else:
         _print(report)
     if plot and report.rows:

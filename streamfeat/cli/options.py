@@ -42,7 +42,7 @@ __all__ = [
 
 
 def _shown(name: str) -> str:
-    """What `--help` says of the value that an option has if it is not given."""
+    """The default of an option as `--help` shows it."""
     return str((DEFAULTS | PRESETS["default"])[name])
 
 

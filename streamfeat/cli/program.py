@@ -1,4 +1,4 @@
-"""What all commands share.
+"""The common part of all commands.
 
 Lives here: the program itself, arguments and options that several commands have, bars, tables, refusals.
 Not here: the commands.
@@ -6,13 +6,14 @@ Not here: the commands.
 
 import contextlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -28,6 +29,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from streamfeat.cli.results import RESULTS, complete, for_people
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import is_replaced, refuse_input
 from streamfeat.files.locations import Location, location_of
@@ -55,6 +57,7 @@ __all__ = [
     "completing",
     "err",
     "out",
+    "print_json",
     "print_losses",
     "print_result",
     "progress_bars",
@@ -62,7 +65,9 @@ __all__ = [
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "train", "replay", "evaluate", "latency", "view")
+_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
+_PIPE_COLUMNS = 1_000
+_PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
@@ -90,8 +95,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-out = Console(highlight=False, emoji=False)
-err = Console(stderr=True, highlight=False, emoji=False)
+
+class _WholeConsole(Console):
+    """A console that cuts nothing where it is no terminal: what reads a pipe or a file has room."""
+
+    @property  # type: ignore[misc]
+    def size(self) -> ConsoleDimensions:
+        size = super().size
+        cuts = self.is_terminal or "COLUMNS" in os.environ
+        return size if cuts else ConsoleDimensions(_PIPE_COLUMNS, size.height)
+
+
+out = _WholeConsole(highlight=False, emoji=False)
+err = _WholeConsole(stderr=True, highlight=False, emoji=False)
 
 
 @app.callback()
@@ -143,8 +159,8 @@ TopicOption = Annotated[
 EmitOption = Annotated[
     str,
     typer.Option(
-        help="When to emit features: event, 1000ev, 10ms or auto.",
-        autocompletion=completing("event", "1000ev", "10ms", "auto"),
+        help="When to emit features: event, 1000ev, 10ms, bin (of the model) or auto.",
+        autocompletion=completing("event", "1000ev", "10ms", "bin", "auto"),
     ),
 ]
 SpeedOption = Annotated[
@@ -156,6 +172,13 @@ SpeedOption = Annotated[
 ModelOption = Annotated[
     Path | None,
     typer.Option("--model", "-m", help="Model, from `streamfeat learn`.", show_default="the general one"),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Threads that share a large emission; features are the same for any number.",
+        show_default="all cores but one",
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]
@@ -302,18 +325,29 @@ def print_losses(losses: "Losses") -> None:
         )
 
 
-def print_result(result: dict[str, Any], title: str, *, as_json: bool) -> None:
-    """Print a result as a table of two columns, or as JSON."""
+def print_result(result: dict[str, Any], title: str, *, as_json: bool, command: str = "") -> None:
+    """Print a result as a table of two columns, or as JSON.
+
+    Args:
+        result: its fields; those of the command that are missing are null in JSON.
+        title: of the table.
+        as_json: print JSON.
+        command: whose fields these are, see `results`; a table only, if it is none.
+    """
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json(command, result)
         return
     table = Table(title=title, show_header=False, title_justify="left", box=None, pad_edge=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")  # or a long path would lose its end in a narrow terminal
-    for name, value in result.items():
-        text = f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
-        table.add_row(name.replace("_", " "), escape(text))
+    for name, text in for_people(result, RESULTS.get(command, {})):
+        table.add_row(name, escape(text))
     out.print(table)
+
+
+def print_json(command: str, result: dict[str, Any]) -> None:
+    """Print the fields of a command's result as one line of JSON."""
+    typer.echo(json.dumps(complete(command, result), allow_nan=False))
 
 
 def refuse_existing(path: Path, *inputs: object, overwrite: bool) -> None:

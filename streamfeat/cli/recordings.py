@@ -1,7 +1,7 @@
 """Commands that look at recordings and make them: info, convert.
 
 Lives here: their arguments, and how their results are shown.
-Not here: reading and writing (`recording`, `recorder`, `foreign`).
+Not here: reading and writing (`recordings`, `convert`).
 """
 
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,17 +54,22 @@ def info(
         with progress_bars() as report:
             report("reading", 0, 0, "")
             n_events = rec.n_events  # reads the whole file
-        height, width = rec.resolution
         labels = sorted({label.label for label in rec.labels})
         splits = sorted({label.split for label in rec.labels if label.split})
         result = {
             "file": str(recording),
-            "topics": ", ".join(
-                f"{t.name} ({t.schema}, {t.schema_encoding}, {t.n_messages})" for t in rec.topics
-            ),
+            "topics": [
+                {
+                    "name": t.name,
+                    "schema": t.schema,
+                    "schema_encoding": t.schema_encoding,
+                    "messages": t.n_messages,
+                }
+                for t in rec.topics
+            ],
             "read": rec.topic,
             "encoding": rec.encoding,
-            "resolution": f"{width}x{height}",
+            "resolution": list(rec.resolution),
             "events": n_events,
             "on": rec.n_on,
             "off": rec.n_off,
@@ -72,13 +77,15 @@ def info(
             "duration_s": rec.duration_us / 1e6,
             "events_per_s": round(n_events / max(rec.duration_us / 1e6, 1e-6)),
             "samples": len(rec.labels),
-            "labels": ", ".join(labels),
-            "splits": ", ".join(splits),
+            "labels": labels,
+            "splits": splits,
             "digest": rec.digest,
             **{name.replace(" ", "_"): rec.counts[name] for name in TIMELINE_COUNTS},
+            "unread": dict(rec.losses.counts),
             "integrity": "damaged" if rec.losses else "intact",
-        } | rec.removed
-        print_result(result, str(recording), as_json=as_json)
+            "removed": rec.removed,
+        }
+        print_result(result, str(recording), as_json=as_json, command="info")
         print_losses(rec.losses)
 
 
@@ -150,7 +157,8 @@ def convert(
                 **formats,  # type: ignore[arg-type]
             )
         print_assumptions(exported.assumptions)
-        print_result(exported.result() | {"written": str(target)}, "converted", as_json=as_json)
+        result: dict[str, Any] = {"written": str(target)} | exported.result()
+        print_result(result, "converted", as_json=as_json, command="convert")
         print_losses(exported.losses)
         if exported.losses:
             raise typer.Exit(1)
@@ -180,7 +188,7 @@ def convert(
             workers=place,
             **formats,  # type: ignore[arg-type]
         )
-    result: dict[str, Any] = {
+    result = {
         "written": str(target),
         "samples": done.samples,
         "events": done.events,
@@ -188,7 +196,8 @@ def convert(
         "bytes_out": done.bytes_out,
         "failed": len(done.failed),
         "damaged": len(done.damaged),
-    } | done.removed
+        "removed": done.removed,
+    }
     faults = {"failed": done.failed, "damaged": done.damaged}
     if as_json:
         result["faults"] = [
@@ -196,7 +205,7 @@ def convert(
             for what, files in faults.items()
             for path, reason in files
         ]
-    print_result(result, "converted", as_json=as_json)
+    print_result(result, "converted", as_json=as_json, command="convert")
     for what, files in faults.items():
         shown = files if verbose else files[:_FAULTS_SHOWN]
         for path, reason in shown:

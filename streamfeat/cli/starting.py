@@ -4,7 +4,6 @@ Lives here: their arguments, and how their results are shown.
 Not here: what they do (`demo`, `doctor`).
 """
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +18,7 @@ from streamfeat.cli.program import (
     app,
     err,
     out,
+    print_json,
     print_result,
     progress_bars,
 )
@@ -71,9 +71,9 @@ def demo(
         "seconds": round(time.monotonic() - started, 1),
     }
     if as_json:
-        typer.echo(json.dumps(result | {"next": job.commands()}))
+        print_json("demo", result | {"next": job.commands()})
     else:
-        print_result(result, "demonstrated", as_json=False)
+        print_result(result, "demonstrated", as_json=False, command="demo")
         out.print("\n[bold]try next[/]")
         for command in job.commands():
             typer.echo(command)  # as it is, for it is to be copied
@@ -92,7 +92,7 @@ def doctor(as_json: JsonOption = False) -> None:
     with progress_bars() as report:
         found = examine(lambda step: report("looking", 0, 0, step))
     if as_json:
-        typer.echo(json.dumps(found))
+        print_json("doctor", found)
     else:
         print_result(_overview(found), "this machine", as_json=False)
         out.print()

@@ -1,7 +1,7 @@
 """Commands that run the main job: replay.
 
 Lives here: their arguments, and how their results are shown.
-Not here: the job (`replay`).
+Not here: the job (`stream.replay`).
 """
 
 import sys
@@ -19,6 +19,7 @@ from streamfeat.cli.program import (
     QuietOption,
     RecordingArgument,
     SpeedOption,
+    ThreadsOption,
     TopicOption,
     VerboseOption,
     app,
@@ -50,7 +51,7 @@ def replay(
     classifier: Annotated[
         Path | None, typer.Option("--classifier", "-c", help="Classifier, from `streamfeat train`.")
     ] = None,
-    emit: EmitOption = "auto",
+    emit: EmitOption = "bin",
     speed: SpeedOption = "max",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write features and predictions to this MCAP file.")
@@ -69,6 +70,7 @@ def replay(
         bool, typer.Option("--learn-online", help="Learn from each label after predicting it.")
     ] = False,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -91,6 +93,7 @@ def replay(
         reading=reading,
         split=split,
         learn_online=learn_online,
+        threads=threads,
     )
     print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"
@@ -107,7 +110,7 @@ def replay(
             report,
         )
     if not to_terminal:
-        print_result(job.result(), "replayed", as_json=as_json)
+        print_result(job.result(), "replayed", as_json=as_json, command="replay")
     print_losses(job.losses)
     for line in job.advice:
         err.print(f"[yellow]too much work:[/] {escape(line)}", soft_wrap=True)

@@ -16,6 +16,7 @@ from streamfeat.cli.program import (
     JsonOption,
     OverwriteOption,
     QuietOption,
+    ThreadsOption,
     TopicOption,
     app,
     err,
@@ -82,6 +83,7 @@ def view(
     loop: Annotated[bool, typer.Option("--loop", help="Start a recording again at its end.")] = False,
     split: Annotated[str | None, typer.Option(help="Only samples of this split.")] = None,
     topic: TopicOption = None,
+    threads: ThreadsOption = None,
     ros2: RosOption = None,
     domain: DomainOption = 0,
     zenoh_config: ConfigOption = None,
@@ -129,6 +131,7 @@ def view(
         classifier,
         emit=emit,
         rate=rate,
+        threads=threads,
         web_port=web_port if on_page else None,
         foxglove_port=port if foxglove else None,
         recording_out=output,
@@ -141,7 +144,7 @@ def view(
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     job.run()
-    print_result(job.result(), "viewed", as_json=as_json)
+    print_result(job.result(), "viewed", as_json=as_json, command="view")
 
 
 def _recording(source: str | None) -> Location | None:

@@ -33,7 +33,7 @@ _HELD_IN_MEMORY = 2 << 20  # bytes of a file, at most 96 times that in events; l
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """What became of a source: counts of what was written, and a line for each file with a fault.
+    """Result of a conversion: counts of what was written, and a line for each file with a fault.
 
     `failed` files are not in the recording; of `damaged` files, all that could be read is.
     `bytes_in` counts the files that were converted, `bytes_out` the recording; `removed` the events that were
@@ -51,7 +51,7 @@ class Conversion:
 
 @dataclass(frozen=True, slots=True)
 class _DataSet:
-    """What the documentation of a data set says and its files do not."""
+    """Facts of a data set that stand in its documentation and not in its files."""
 
     duration_us: int
     """Nominal length of a sample."""
@@ -83,7 +83,7 @@ _NOTHING = _Measured((), (1, 1), 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What became of reading one file, and its bytes."""
+    """The outcome of reading one file, and its bytes."""
 
     file: _Measured
     damage: str = ""
@@ -155,7 +155,7 @@ def _files(folder: Location) -> Iterable[tuple[Location, str]]:
     """Files in a folder, however deep, each with its path from there."""
     if isinstance(folder, StoreLocation):
         return files_below(folder)
-    # A link that leads nowhere is a sample that cannot be read, which somebody should hear of.
+    # A link that leads nowhere is a sample that cannot be read, and is reported as one.
     return (
         (path, path.relative_to(folder).as_posix())
         for path in folder.rglob("*")
@@ -232,7 +232,7 @@ def convert(
 
 
 def _of_place(error: InputError, path: Location, place: Location) -> str:
-    """What is wrong with a file, by the name that its user knows."""
+    """An error with the name of the file that the user gave."""
     return str(error).replace(str(path), str(place))
 
 

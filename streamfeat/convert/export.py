@@ -1,6 +1,6 @@
 """One recording to a file of another kind, or some of it.
 
-Lives here: what is counted on the way, and what a kind of file cannot hold.
+Lives here: the counts of a conversion, and the limits of each kind of file.
 Not here: reading (`streamfeat.recordings`), the kinds of files (`outputs`), data sets of many files
 (`datasets`).
 """
@@ -25,12 +25,12 @@ __all__ = ["Exported", "convert_recording"]
 
 @dataclass(slots=True)
 class Exported:
-    """What was written, and what was not.
+    """Counts of a conversion.
 
     Attributes:
         events: in the file.
         labels: in the file.
-        labels_left_out: for they reach beyond the selection, or the kind of file holds no labels.
+        labels_left_out: those that reach beyond the selection, or that the kind of file cannot hold.
         subtracted_us: from every time, where the kind of file cannot hold them as they are.
         removed: events taken out as noise, by reason.
         losses: what of the source could not be read.
@@ -48,10 +48,9 @@ class Exported:
     bytes_out: int = 0
 
     def result(self) -> dict[str, Any]:
-        """The counts, as JSON values; but for the first two only those that are not 0."""
-        names = ("labels", "labels_left_out", "subtracted_us")
-        more = {name: value for name in names if (value := getattr(self, name))}
-        return {"events": self.events, "bytes_out": self.bytes_out} | more | self.removed
+        """The counts, as JSON values."""
+        names = ("events", "labels", "labels_left_out", "subtracted_us", "bytes_out", "removed")
+        return {name: getattr(self, name) for name in names}
 
 
 def convert_recording(

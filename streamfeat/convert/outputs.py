@@ -55,11 +55,11 @@ class Output(Protocol):
         """Write a label, before its events, where the format has labels."""
 
     def finish(self) -> None:
-        """Write what is left; nothing is written after that."""
+        """Write the rest; call it last."""
 
 
 class _OneSensor:
-    """What the formats share that hold one sensor and no labels.
+    """The common part of formats that hold one sensor and no labels.
 
     Where `needs_order` is set, events are put in order of time within `HELD_US`.
     """
@@ -304,7 +304,7 @@ def open_output(
     """
     kind = path.suffix.lower()
     if kind not in KINDS:
-        raise InputError(f"{path}: what kind of file is that? Its name must end in {', '.join(KINDS)}")
+        raise InputError(f"{path}: an unknown ending; files that can be written end in {', '.join(KINDS)}")
     if kind == ".mcap":
         with RecordingWriter(path, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
             yield McapOutput(writer)

@@ -22,7 +22,7 @@ _BEHIND_US = 10_000_000
 
 @dataclass(slots=True)
 class Selection:
-    """What is taken of a recording.
+    """A selection of a recording: a stretch of time and a rectangle of pixels.
 
     Attributes:
         start_us: after the first event.
@@ -62,7 +62,7 @@ class Selection:
         return bool(self.start_us or self.end_us is not None or self.crop)
 
     def items(self, items: Iterable[Packet | Label]) -> Iterator[Packet | Label]:
-        """What is taken of a stream; packets without events are left out.
+        """The selected items of a stream; packets without events are left out.
 
         Raises:
             InputError: the crop does not fit into the sensor.

@@ -22,6 +22,7 @@ from streamfeat.classify.features import encode_samples
 from streamfeat.demo.terminal import EventPicture, TerminalView
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.settings import Setting
@@ -39,7 +40,7 @@ from streamfeat.stream.warming import warm_up
 __all__ = ["FILES", "Demo"]
 
 FILES = ("train.mcap", "test.mcap", "model", "classifier")
-"""What the demonstration writes."""
+"""Files that the demonstration writes."""
 
 SIZES = {"train": 200, "test": 40}
 """Digits of each recording."""
@@ -63,7 +64,7 @@ class Demo:
     """
 
     def __init__(self, folder: Path, report: Report = lambda step, done, total, remark: None) -> None:
-        """Nothing is written before `simulate`."""
+        """Write nothing before `simulate`."""
         self.train, self.test, self.model, self.classifier = (folder / name for name in FILES)
         self._report = report
         self._compiler: BaseProcess | None = None
@@ -167,7 +168,7 @@ class Demo:
         }
 
     def commands(self) -> list[str]:
-        """What to try next, as a shell takes it."""
+        """Commands to try next, quoted for a shell."""
         train, test, model, classifier = (
             shlex.quote(str(path)) for path in (self.train, self.test, self.model, self.classifier)
         )
@@ -186,20 +187,9 @@ def _use_kernels(encoder: Encoder) -> None:
 
 
 def _compile_kernels() -> None:
-    """What kernels are compiled for are types: an encoder that has learned nothing does."""
+    """Compile by an encoder that has learned nothing: kernels are compiled for types, not for values."""
     geometry = Geometry(patch=_SETTING.patch, n_bins=1, bin_us=1_000)
-    d = geometry.patch**2
-    _use_kernels(
-        Encoder.build(
-            geometry,
-            formulation="direct",
-            encoding="split",
-            threshold=0.1,
-            filters=np.eye(2, d, dtype=np.float32),
-            whitening=np.eye(d, dtype=np.float32),
-            mean=np.zeros(d, np.float32),
-        )
-    )
+    _use_kernels(random_encoder(0, geometry, 2, encoding="split"))
 
 
 class _Watched:

@@ -33,7 +33,7 @@ def parse_duration(text: str, option: str) -> int:
     """Read a duration such as `500us`, `1ms` or `0.2s`, in microseconds.
 
     Raises:
-        InputError: it is none, or not between 1 us and an hour; names the option.
+        InputError: the text is not a time between 1 us and an hour; names the option.
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(us|ms|s)", text.strip())
     us = round(float(found[1]) * _UNITS_US[found[2]]) if found else 0
@@ -44,7 +44,7 @@ def parse_duration(text: str, option: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Denoising:
-    """What is taken out; 0 takes nothing out for that reason. They are looked at in this order.
+    """Kinds of noise to take out, looked at in this order; 0 leaves one kind in.
 
     Attributes:
         hot_rate: events a second from one pixel, above which the pixel is hot. The rate is that of a leaky

@@ -8,17 +8,16 @@ pooled sums up to date with whatever has changed since. What is read depends on 
 time, never on how often it was read or how the stream was cut into batches.
 """
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
+from streamfeat.engine.snapshot import Snapshot, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
-from streamfeat.errors import InputError
+from streamfeat.engine.threads import Crew
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow, trace
@@ -26,6 +25,7 @@ from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
+    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
@@ -34,21 +34,13 @@ from streamfeat.kernels.layout import (
     CLOCK_TOUCHED,
     CURSOR_CODED,
     MOMENT_SQUARES,
-    PARTS,
     TALLY_EVENTS,
 )
-from streamfeat.kernels.planes import complete, look_ahead
-from streamfeat.kernels.update import finish, mark_dirty, read, renew, settle, update
+from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
+from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
 from streamfeat.report.shown import Shown
 
-__all__ = ["Engine", "EngineStats", "Snapshot", "Spread"]
-
-Spread = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
-"""Calls a function for each of some numbers: `map`, one after the other, or the `map` of an executor."""
-
-_WORTH_SPREADING = 1 << 20
-"""Filters times volumes or entries that changed: a millisecond of work at least, against a tenth of one for
-handing half of it to another thread."""
+__all__ = ["Engine", "EngineStats"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,29 +66,6 @@ class EngineStats:
     encoded_volumes: int
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """All that an engine needs to go on as if nothing had happened.
-
-    Attributes:
-        fingerprint: of the encoder.
-        counts: `(T, H, W)` int32, the ring; bin `b` lives in slot `b % T`.
-        atoms: `(V, K)` float64, lasso codes to start from (inverse formulation; else `(V, 0)`).
-        bin: the current one; `BEFORE_TIME` in an engine that has seen nothing.
-        origin_us: stream time at which bin 0 starts.
-        tally: `(5,)` int64, what was counted.
-        encoded: `(2,)` int64, volumes encoded in the upper and in the lower half of the grid.
-    """
-
-    fingerprint: str
-    counts: NDArray[np.int32]
-    atoms: NDArray[np.float64]
-    bin: int
-    origin_us: int
-    tally: NDArray[np.int64]
-    encoded: NDArray[np.int64]
-
-
 class Engine(Shown):
     """Turns a stream of events into features, exactly.
 
@@ -106,11 +75,11 @@ class Engine(Shown):
         origin_us: stream time at which bin 0 starts.
         look_ahead: prepare each bin boundary beforehand, in slices: with every event that is followed, and
             in `prepare`. Costs a second copy of the projections; for those who read after single events.
-        spread: how the two halves of a large reading are made: `map`, or an executor's, for two cores.
+        threads: that share the work of a large emission; features have the same bits for any number.
 
     Raises:
-        InputError: the sensor has no place for a single volume, or so many that sums could overflow; or the
-            origin is beyond 2^62 microseconds.
+        InputError: the sensor has no place for a single volume, or so many that sums could overflow; the
+            origin is beyond 2^62 microseconds; or threads are not 1 to 256.
     """
 
     def __init__(
@@ -120,20 +89,21 @@ class Engine(Shown):
         *,
         origin_us: int = 0,
         look_ahead: bool = False,
-        spread: Spread = map,
+        threads: int = 1,
     ) -> None:
         """Allocate everything; nothing is allocated later but the copies that are handed out."""
         self.encoder = encoder
         self.resolution = resolution
         self.grid_shape = encoder.geometry.grid_shape(resolution)
-        self._spread = spread
+        self._crew = Crew(threads)
         self._operator = with_fixed_point(encoder.operator, self.grid_shape)
         self._state = allocate_state(
             encoder.geometry,
             self._operator,
             resolution,
-            origin_us=self._checked_time(origin_us),
+            origin_us=checked_time(origin_us),
             planes=2 if look_ahead else 1,
+            threads=threads,
         )
 
     def feed(self, batch: Events) -> None:
@@ -163,7 +133,7 @@ class Engine(Shown):
         """
         events = self._checked(batch)
         self._update()
-        follow(events, self.grid_shape, self._operator, self._state)
+        follow(events, self._operator, self._state)
 
     def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Feed a batch event by event, and read the features after each.
@@ -182,7 +152,7 @@ class Engine(Shown):
         self._update()
         features = np.empty((len(events), n_features(self._operator)), np.float32)
         accepted = np.empty(len(events), np.int64)
-        trace(events, self.grid_shape, self._operator, self._state, features, accepted)
+        trace(events, self._operator, self._state, features, accepted)
         return features, accepted
 
     def prepare(self, columns: int) -> bool:
@@ -196,24 +166,26 @@ class Engine(Shown):
         """
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
-        left = look_ahead(volumes, volumes, columns, self.grid_shape, self._operator, self._state)
+        left = look_ahead(volumes, volumes, columns, self._operator, self._state)
         return bool(left > 0)
 
     def _update(self) -> None:
         """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
-        shape, operator, state = self.grid_shape, self._operator, self._state
+        operator, state, crew = self._operator, self._state, self._crew
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
-        volumes = 0 if self._is_complete else shape[0] * shape[1]
-        large = max(volumes, int(state.clock[CLOCK_TOUCHED])) * operator.offset.shape[0] >= _WORTH_SPREADING
-        if self._spread is map or not large:
-            update(shape, operator, state)
+        filters = operator.offset.shape[0]
+        if crew.parts_for(self._most_volumes * filters) == 1:
+            update(operator, state)
             return
-        mark_dirty(shape, operator, state)
-        self._halves(lambda part: renew(part, shape, operator, state))
-        settle(operator, state)
-        self._halves(lambda part: complete(part, shape, operator, state))
-        finish(shape, state)
+        mark_dirty(operator, state)
+        renewing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
+        crew.share(renew, renewing, operator, state)
+        settle(state)
+        list_missing(operator, state)
+        completing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
+        crew.share(complete, completing, operator, state)
+        finish(max(renewing, completing), operator, state)
 
     @property
     def _is_complete(self) -> bool:
@@ -221,9 +193,15 @@ class Engine(Shown):
         coded = state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED]
         return bool(coded == self.grid_shape[0] * self.grid_shape[1])
 
-    def _halves(self, work: Callable[[int], None]) -> None:
-        for _ in self._spread(work, range(PARTS)):
-            pass
+    @property
+    def _most_volumes(self) -> int:
+        """A bound of the volumes that an update has to work on."""
+        volumes = self.grid_shape[0] * self.grid_shape[1]
+        if not self._is_complete:
+            return volumes
+        covering = -((-self._operator.patch // self._operator.stride) ** 2)
+        touched = int(self._state.clock[CLOCK_TOUCHED])
+        return len(self._state.cursors) * min(volumes, touched * covering)
 
     @staticmethod
     def _checked(batch: Events) -> Events:
@@ -241,23 +219,17 @@ class Engine(Shown):
         Raises:
             InputError: the time is beyond 2^62 microseconds.
         """
-        since = self._checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
+        since = checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
         new = since // self._operator.bin_us
         if new > self._state.clock[CLOCK_NOW]:
             advance_to_bin(new, self._operator, self._state)
 
-    @staticmethod
-    def _checked_time(t_us: int) -> int:
-        if not BEFORE_TIME < t_us < -BEFORE_TIME:
-            raise InputError(f"a time of {t_us} us is beyond 2^62")
-        return int(t_us)
-
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._spread is not map:
+        if self._crew.threads > 1:
             self._update()
         features = np.empty(n_features(self._operator), np.float32)
-        read(self.grid_shape, self._operator, self._state, features)
+        read(self._operator, self._state, features)
         return features
 
     def codes(self) -> NDArray[np.float32]:
@@ -310,7 +282,7 @@ class Engine(Shown):
         Raises:
             InputError: the origin is beyond 2^62 microseconds.
         """
-        state, origin = self._state, self._checked_time(origin_us)
+        state, origin = self._state, checked_time(origin_us)
         state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
         for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
             array[:] = 0
@@ -343,7 +315,7 @@ class Engine(Shown):
             bin=int(state.clock[CLOCK_NOW]),
             origin_us=int(state.clock[CLOCK_ORIGIN]),
             tally=state.tally.copy(),
-            encoded=state.encoded.copy(),
+            encoded=np.array([state.encoded.sum(), 0]),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -355,7 +327,7 @@ class Engine(Shown):
             InputError: the snapshot is of another encoder or another resolution, or of no engine at all;
                 nothing has changed.
         """
-        self._check(snapshot)
+        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state)
         state, limit = self._state, self._operator.max_count
         codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
         self.restart(snapshot.origin_us)
@@ -367,31 +339,8 @@ class Engine(Shown):
             state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
             state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        update(self.grid_shape, self._operator, state)
+        update(self._operator, state)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
-        state.encoded[:] = snapshot.encoded
-
-    def _check(self, snapshot: Snapshot) -> None:
-        state, operator = self._state, self._operator
-        if snapshot.fingerprint != self.encoder.fingerprint:
-            raise InputError(
-                f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has "
-                f"{self.encoder.fingerprint[:12]}"
-            )
-        mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, state.encoded)
-        for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
-            given = getattr(snapshot, name)
-            if given.dtype != array.dtype or given.shape != array.shape:
-                raise InputError(
-                    f"the snapshot holds {name} of {given.dtype} {given.shape}, this engine has "
-                    f"{array.dtype} {array.shape}"
-                )
-        # No solution exceeds half of it; one within the gap may, by a little.
-        if not (np.abs(snapshot.atoms) <= 2 * operator.largest).all():
-            raise InputError("the snapshot: an entry of a code is no number, or too large")
-        if min(snapshot.tally.min(), snapshot.encoded.min()) < 0:
-            raise InputError("the snapshot: something was counted less than zero times")
-        self._checked_time(snapshot.origin_us)
-        if snapshot.bin != BEFORE_TIME:
-            self._checked_time(snapshot.origin_us + snapshot.bin * operator.bin_us)
+        state.encoded[:] = 0
+        state.encoded[0] = snapshot.encoded.sum()

@@ -45,7 +45,7 @@ class Geometry:
             "n_bins": 1024,
             "bin_us": 2**40,
             "downsample": 1024,
-            "max_count": 2**15 - 1,
+            "max_count": 2**14 - 1,  # or the change of a count would not fit into 16 bits
             "pooling": 64,
         }
         for name, most in upper.items():

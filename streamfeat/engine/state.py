@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.operator import aligned_zeros
 from streamfeat.events import Resolution
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_START,
-    PARTS,
     SPLIT,
     Operator,
     State,
 )
+from streamfeat.kernels.vectors import MASK_BITS
 
 __all__ = ["allocate_state"]
 
@@ -31,6 +32,7 @@ def allocate_state(
     origin_us: int = 0,
     planes: int = 1,
     keep: bool = True,
+    threads: int = 1,
 ) -> State:
     """An empty state for one sensor.
 
@@ -40,6 +42,7 @@ def allocate_state(
         resolution: `(height, width)` of the sensor.
         origin_us: start of bin 0.
         planes: 1, or 2 to look ahead.
+        threads: that share the work of large emissions.
         keep: keep a projection for each volume; without, the state serves whole windows only.
 
     Raises:
@@ -57,6 +60,7 @@ def allocate_state(
     return State(
         counts=np.zeros(ring, np.int32),
         applied=np.zeros(ring, np.int16),
+        news=np.zeros(ring, np.int16),
         touched=np.zeros(int(np.prod(ring)) + 1, np.int32),
         is_touched=np.zeros(ring, np.uint8),
         touched_slots=np.zeros(geometry.n_bins, np.uint8),
@@ -67,21 +71,24 @@ def allocate_state(
         clock=clock,
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
-        encoded=np.zeros(PARTS, np.int64),
-        projections=np.zeros((planes, volumes, padded), np.int32),
+        encoded=np.zeros(threads, np.int64),
+        projections=aligned_zeros((planes, volumes, padded), np.int32),
         moments=np.zeros((planes, volumes, 4), np.int64),
         atoms=np.zeros((planes, volumes, 2, atoms), np.float64),
-        pooled=np.zeros((planes, operator.pooling**2, features), np.int32),
+        pooled=aligned_zeros((planes, operator.pooling**2, features), np.int32),
+        partial=aligned_zeros((threads - 1, planes, operator.pooling**2, features), np.int32),
         cells=_cells(operator.pooling, rows, columns),
-        dirty=np.zeros(planes * volumes, np.int32),
+        lines=np.zeros((2, ring[2] + 1), np.int32),
+        crowds=np.zeros((ring[1] + 1, columns), np.int32),
+        dirty=np.zeros(planes * rows * columns, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
-        code=np.zeros((PARTS, 2, padded), np.int32),
-        work=np.zeros((PARTS, 5, padded), np.float64),
-        active=np.zeros((PARTS, padded), np.int64),
-        values=np.zeros((PARTS, geometry.entries), np.int16),
-        entries=np.zeros((PARTS, geometry.entries), np.int32),
-        changes=np.zeros((PARTS, geometry.entries), np.int16),
-        corners=np.zeros((PARTS, atoms * padded), np.float32),
+        code=aligned_zeros((threads, 3, padded), np.int32),
+        work=np.zeros((threads, 5, padded), np.float64),
+        active=np.zeros((threads, padded), np.int64),
+        values=aligned_zeros((threads, 2, -(-geometry.entries // MASK_BITS) * MASK_BITS), np.int16),
+        entries=np.zeros((threads, geometry.entries + 1), np.int32),
+        changes=np.zeros((threads, geometry.entries + 1), np.int16),
+        corners=np.zeros((threads, atoms * padded), np.float32),
     )
 
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.state import allocate_state
-from streamfeat.events import Events, Resolution
+from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.kernels.encode import read_features
-from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_SLOT, PARTS, Operator
-from streamfeat.kernels.planes import complete
+from streamfeat.kernels.layout import CLOCK_SLOT, Operator
+from streamfeat.kernels.planes import fill_plane
 
 __all__ = ["count_window", "encode_window"]
 
@@ -38,9 +38,8 @@ def count_window(
         `(n_bins, H, W)` int16 in ring pixels, oldest bin first.
     """
     ring = (geometry.n_bins, *geometry.ring_shape(resolution))
-    height, width = resolution
     x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
-    good = (x < width) & (y < height) & ((p == 0) | (p == 1)) & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
+    good = is_valid(events, resolution)
     if not good.all():
         x, y, p, t = x[good], y[good], p[good], t[good]
     if len(t) == 0:
@@ -66,13 +65,11 @@ def encode_window(
     t_us: int | None = None,
 ) -> NDArray[np.float32]:
     """Features of one window; see `Encoder.encode`."""
-    shape = geometry.grid_shape(resolution)
-    pooling = with_fixed_point(operator, shape)
+    pooling = with_fixed_point(operator, geometry.grid_shape(resolution))
     state = allocate_state(geometry, pooling, resolution, keep=False)
     state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
     state.clock[CLOCK_SLOT] = geometry.n_bins - 1  # the window ends with the last slot
-    for part in range(PARTS):
-        complete(part, shape, pooling, state)
+    fill_plane(pooling, state)
     features = np.empty(n_features(pooling), np.float32)
     read_features(pooling, state, features)
     return features

@@ -132,7 +132,7 @@ def _looked_into(
     report: Report,
     early_samples: int,
 ) -> dict[str, Any]:
-    """What is found out about the base setting only."""
+    """Results that are made for the base setting only."""
     report("prequential", 0, 1, "")
     order = np.random.default_rng(cell.setting.seed).permutation(len(samples.labels))
     labels = samples.labels.tolist()
@@ -176,7 +176,7 @@ def _samples(recordings: Iterable[Recording]) -> Iterator[Sample]:
 
 
 def _learned(encoder: Encoder) -> dict[str, Any]:
-    """What the report draws of an encoder: some filters in the whitened domain, and how learning went."""
+    """For the report: some filters in the whitened domain, and the course of learning."""
     geometry = encoder.geometry
     shown = np.unique(np.linspace(0, encoder.n_filters - 1, _SHOWN_FILTERS).astype(int))
     return {

@@ -1,7 +1,7 @@
-"""What is to be evaluated: methods, settings, and the cells of the table that follow.
+"""The plan of an evaluation: methods, settings, and the cells of the resulting table.
 
-Lives here: `Cell` and its `Trial`, what of a setting each method uses, and sweeps as they are asked for.
-Not here: what can be set (`learn.setting`), what is done in a cell (`cell`).
+Lives here: `Cell` and its `Trial`, the settings that each method uses, and sweeps as they are asked for.
+Not here: the settings of learning (`learn.settings`), the work of a cell (`cell`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,12 +35,12 @@ _OTHERS_USE = {
     "hots": ("seed", *_TRAINING),
     "counts": _TRAINING,
 }
-"""What those use that learn no filters here."""
+"""Settings of methods that learn no filters here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial(Setting):
-    """What a run can be told: all that `learn` can, and how the classifier is trained.
+    """The settings of a run: those of `learn`, and those of training the classifier.
 
     Attributes:
         model: path of the model that the method `model` takes; the general model that ships if empty.
@@ -72,7 +72,7 @@ class Trial(Setting):
 _DEFAULTS = {field.name: field.default for field in fields(Trial)}
 
 SWEPT = tuple(name for name in _DEFAULTS if name != "formulation")
-"""What can be swept; the formulation is a method."""
+"""Settings that can be swept; the formulation is a method."""
 
 
 def used_by(method: str) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ def used_by(method: str) -> tuple[str, ...]:
 class Cell:
     """One run: a method in a setting on a fold; `swept` names what differs from the base, if anything.
 
-    What the method does not use has its default in the setting, so that equal runs are equal cells.
+    Settings that the method does not use have their defaults, so that equal runs are equal cells.
     """
 
     method: str

@@ -1,7 +1,7 @@
 """All cells, each kept as soon as it is done, and the result that they add up to.
 
 Lives here: the loop, the state file that an interrupted run goes on from, sums over folds.
-Not here: what a cell does (`cell`), the result as text or page (`tables`, `page`).
+Not here: the work of a cell (`cell`), the result as text or page (`tables`, `page`).
 """
 
 import json
@@ -45,7 +45,7 @@ _UNITS_IN_WORDS = {
 
 
 def state_path(output: Path) -> Path:
-    """Where the state of a run is kept whose result goes to `output`."""
+    """The state file of a run whose result goes to `output`."""
     return output.with_name(output.name + ".part")
 
 

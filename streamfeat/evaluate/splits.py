@@ -1,4 +1,4 @@
-"""What is learned from and what is scored.
+"""The samples to learn from and those to score.
 
 Lives here: labelled recordings whose samples are held out, by their own splits or by folds.
 Not here: learning and scoring.

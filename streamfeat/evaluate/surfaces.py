@@ -1,4 +1,4 @@
-"""What our features are compared with: count images, HATS, HOTS.
+"""Features of others, for comparison: count images, HATS, HOTS.
 
 Lives here: each of them as a map from the events of a sample to a feature vector, as an encoder is one.
 Not here: features made by filters (`methods`), and the loops over events (`kernels.surfaces`).
@@ -26,7 +26,7 @@ _FITTED_SAMPLES = 1_000
 
 @dataclass(frozen=True, slots=True)
 class CountImage:
-    """Events of each polarity, counted on a grid as large as the sample: what a camera's picture would be.
+    """Events of each polarity, counted on a grid as large as the sample, like the picture of a camera.
 
     Attributes:
         grid: rows and columns of the grid.

@@ -73,7 +73,7 @@ def _interval(row: dict[str, Any]) -> str:
 
 
 def sweep_tables(result: dict[str, Any]) -> Iterator[tuple[str, Lines]]:
-    """For each sweep its name and a table: what was measured, and the paper's figures where it has them."""
+    """For each sweep its name and a table of measured figures, beside the paper's where it has them."""
     swept = dict.fromkeys(row["swept"] for row in result["rows"] if row["swept"])
     for name in swept:
         rows = [row for row in result["rows"] if row["swept"] == name]
@@ -176,7 +176,7 @@ def confusion_table(row: dict[str, Any], names: Sequence[str]) -> Lines:
 
 
 def notes(result: dict[str, Any]) -> list[str]:
-    """What has to be known to read the tables."""
+    """Notes for reading the tables."""
     samples = result["samples"]
     lines = [
         f"{', '.join(result['recordings'])}: {samples['training']:,} samples to learn from, "
@@ -239,7 +239,7 @@ def notes(result: dict[str, Any]) -> list[str]:
 
 
 def _leakage_note(leakage: dict[str, Any]) -> str:
-    """What a nearest neighbour says of how samples are held out."""
+    """The accuracy of a nearest neighbour in pixels, as a check of how samples are held out."""
     text = (
         f"Near copies: a nearest neighbour on 12x12 counts is right for {leakage['shuffled']:.1%} of samples "
         f"under shuffled folds, {leakage['blocks']:.1%} under blocks, {leakage['scored']:.1%} as scored here."

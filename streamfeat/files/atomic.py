@@ -86,7 +86,7 @@ def refuse_input(output: Path, inputs: Iterable[str | PathLike[str] | object]) -
     """Refuse an output that is one of the inputs, under whatever name; what is no path is passed over.
 
     Raises:
-        InputError: it is.
+        InputError: it is one of them.
     """
     for one in inputs:
         with contextlib.suppress(OSError):
@@ -104,7 +104,7 @@ def sweep(path: Path) -> None:
 
 
 def followed(path: Path) -> Path:
-    """What links lead to in the end; an open file of this process, such as `/dev/stdout`, is no link here."""
+    """The path that links lead to in the end; `/dev/stdout` and other open files of this process stay."""
     target = path.absolute()
     for _ in range(_MOST_LINKS):
         if open_file_of(target) is not None or not target.is_symlink():

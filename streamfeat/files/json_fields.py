@@ -1,4 +1,4 @@
-"""Values of a JSON object that nobody has vouched for.
+"""Values of an untrusted JSON object.
 
 Lives here: taking them out one by one, with type and range checked.
 Not here: what they mean.
@@ -17,7 +17,7 @@ _LARGEST = 1 << 62
 
 
 class Fields:
-    """A JSON object; each way to take a value raises InputError where it is missing or not what it must be.
+    """A JSON object; each accessor refuses a value that is missing, of another type or out of range.
 
     Args:
         values: what was read.

@@ -67,7 +67,7 @@ class StoreLocation:
 
     @property
     def name(self) -> str:
-        """What comes after the last slash."""
+        """The part after the last slash."""
         # The first of a chain that has a path is what is read; those behind it are where it is kept.
         first = next(part for part in self.url.split("::") if "://" in part)
         path = first.partition("://")[2]
@@ -85,7 +85,7 @@ Location = Path | StoreLocation
 
 
 def location_of(text: "str | PathLike[str] | StoreLocation") -> Location:
-    """The place that somebody means: a location for a URL, a path for everything else."""
+    """The location that a text names: a store for a URL, a path for everything else."""
     if isinstance(text, StoreLocation):
         return text
     if isinstance(text, str) and _URL.match(text):
@@ -99,7 +99,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 
 def absolute(place: Location) -> Location:
-    """The same place, whatever folder somebody works in."""
+    """The same location, whatever the working directory."""
     return place.absolute() if isinstance(place, Path) else place
 
 
@@ -246,7 +246,7 @@ class _StoredFile(io.BufferedIOBase):
         if not wanted:
             return b""
         with _explaining(self._location, f"byte {self._at}: "):
-            # Everybody who opens a file in fsspec's memory shares one position.
+            # All files opened in fsspec's memory share one position.
             self._file.seek(self._at)
             data = bytes(self._file.read(wanted))
         if len(data) < wanted:

@@ -99,7 +99,7 @@ class OutputFile:
             return
         try:
             self.file.flush()
-            if self.part and fcntl:  # before the lock goes: nobody else may begin with this part
+            if self.part and fcntl:  # before the lock goes: no other writer may begin with this part
                 self.part.replace(self._target)
             self.file.close()
             if self.part and not fcntl:

@@ -1,7 +1,7 @@
 """The safetensors files that models and classifiers are kept in.
 
-Lives here: arrays and a JSON header, written whole, and read from bytes that nobody has vouched for.
-Not here: what the arrays mean; whoever asks for them checks shapes and ranges.
+Lives here: arrays and a JSON header, written whole, and read from untrusted bytes.
+Not here: what the arrays mean; their reader checks shapes and ranges.
 """
 
 import json
@@ -31,7 +31,7 @@ def write_safetensors(
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, on one line."""
+    """The message of an exception on one line."""
     text = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
     return " ".join(text.split())
 

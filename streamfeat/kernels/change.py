@@ -20,104 +20,129 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
-from streamfeat.kernels.volume import change_entries, change_moments, gather_volume
+from streamfeat.kernels.volume import change_entries, change_moments, gather_volume, sum_columns
+
+ONCE, NO_THREAD = np.int64(1), np.int64(0)
+"""The list of one event has one entry; the first part of an update is that of the calling thread."""
 
 
 @kernel
-def change_volume(
-    plane: int, volume: int, entry: int, change: int, shape: tuple[int, int], operator: Operator, state: State
-) -> None:
-    """Let one entry of a volume change, whatever its code is; its part in the pooled sums follows if coded.
+def change_volume(plane: int, volume: int, n: int, part: int, operator: Operator, state: State) -> None:
+    """Let listed entries of a volume change, whatever its code is; its part in the sums follows if coded.
 
     Args:
         plane: of the volume.
         volume: which.
-        entry: index into the volume.
-        change: of its clipped count, 1 or -1.
-        shape: rows and columns of the grid of volumes.
+        n: length of the list, which is in `entries` and `changes` of the part.
+        part: whose scratch and sums to use.
         operator: the encoder.
-        state: the plane and scratch are changed; `values[0]` holds the entries before the change, all of
-            them where the operator has a quadratic form.
+        state: the plane, sums and scratch are changed; `values[part, 0]` holds the listed entries before the
+            change, and all others too where the operator has a quadratic form.
     """
-    part = np.int64(0)
     coded = volume < state.cursors[plane, CURSOR_CODED]
     if coded:
-        pool_volume(plane, volume, volume, TAKE, part, shape, operator, state)
-    state.entries[part, 0] = entry
-    state.changes[part, 0] = change
+        pool_volume(plane, volume, volume, TAKE, part, operator, state)
     change_entries(
-        np.int64(1),
+        n,
         state.entries[part],
         state.changes[part],
-        state.values[part],
+        state.values[part, 0],
         operator,
         state.projections[plane, volume],
         state.moments[plane, volume],
+        state.code[part, 2],
     )
     if coded:
-        pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
+        pool_volume(plane, volume, volume, ADD, part, operator, state)
 
 
 @inlined
-def move_volume(
-    plane: int, volume: int, entry: int, change: int, shape: tuple[int, int], operator: Operator, state: State
-) -> None:
+def move_volume(plane: int, volume: int, n: int, part: int, operator: Operator, state: State) -> None:
     """The same for a volume that has a code in closed form and is not empty before or after, in one run.
 
     Args: as for `change_volume`.
     """
     projection, moments = state.projections[plane, volume], state.moments[plane, volume]
-    pooled, column = state.pooled[plane, state.cells[volume]], operator.columns[entry]
-    entries, eps = operator.columns.shape[0], operator.eps
-    sigma = deviation(moments, entries, eps)
+    entries, changes, values = state.entries[part], state.changes[part], state.values[part, 0]
+    d, eps, cell = operator.columns.shape[0], operator.eps, state.cells[volume]
+    sums = state.pooled[plane, cell] if part == 0 else state.partial[part - 1, plane, cell]
+    sigma = deviation(moments, d, eps)
+    length = np.float32(0)
     if operator.kind == TRIANGLE:
         length = np.float32(whitened_square(moments, sigma, operator))
-        change_moments(entry, change, state.values[0], operator, moments)
-        after = deviation(moments, entries, eps)
+    change_moments(n, entries, changes, values, operator, moments)
+    after = deviation(moments, d, eps)
+    before_after = gain(sigma, operator), gain(after, operator)
+    if operator.kind == TRIANGLE:
+        total = state.code[part, 2]
+        sum_columns(n, entries, changes, operator.columns, total)
         move_triangle(
-            change,
-            column,
+            ONCE,
+            total,
             projection,
-            (gain(sigma, operator), gain(after, operator)),
+            before_after,
             (length, np.float32(whitened_square(moments, after, operator))),
             operator.offset,
             operator.square_norms,
             operator.n_filters,
             np.float32(operator.unit),
-            pooled,
-            state.code[0],
+            sums,
+            state.code[part],
         )
     else:
-        change_moments(entry, change, state.values[0], operator, moments)
-        move_code(
-            change,
-            column,
-            projection,
-            gain(sigma, operator),
-            gain(deviation(moments, entries, eps), operator),
-            operator.offset,
-            np.float32(operator.threshold),
-            operator.kind,
-            pooled,
-        )
-    state.encoded[0] += 1
+        threshold, offset, kind = np.float32(operator.threshold), operator.offset, operator.kind
+        if n == 1 and abs(changes[0]) == 1:
+            change, column = np.int64(changes[0]), operator.columns[entries[0]]
+            move_code(
+                change,
+                column,
+                projection,
+                before_after[0],
+                before_after[1],
+                offset,
+                threshold,
+                kind,
+                sums,
+            )
+        else:
+            total = state.code[part, 2]
+            sum_columns(n, entries, changes, operator.columns, total)
+            move_code(
+                ONCE, total, projection, before_after[0], before_after[1], offset, threshold, kind, sums
+            )
+    state.encoded[part] += 1
 
 
 @inlined
-def change_place(
-    position: int, row: int, column: int, shape: tuple[int, int], operator: Operator, state: State
-) -> None:
+def follow_changes(plane: int, volume: int, n: int, part: int, operator: Operator, state: State) -> None:
+    """Let listed entries of a volume change, in the shortest way.
+
+    Args: as for `change_volume`.
+    """
+    squares = state.moments[plane, volume, MOMENT_SQUARES]
+    after = squares
+    for i in range(n):
+        change = np.int64(state.changes[part, i])
+        after += change * (2 * np.int64(state.values[part, 0, state.entries[part, i]]) + change)
+    if volume < state.cursors[plane, CURSOR_CODED] and not operator.inverse and squares != 0 and after != 0:
+        move_volume(plane, volume, n, part, operator, state)
+    else:
+        change_volume(plane, volume, n, part, operator, state)
+
+
+@inlined
+def change_place(position: int, row: int, column: int, operator: Operator, state: State) -> None:
     """Let the volumes of all planes that cover one changed entry of the ring follow it.
 
     Args:
         position: bin of the entry in the window, oldest first; its clipped count went up or down by one.
         row: of the entry in the ring.
         column: of the entry in the ring.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: planes, `applied` and scratch are changed.
     """
     n_bins, patch, limit = state.counts.shape[0], operator.patch, operator.max_count
+    values = state.values[0, 0]
     slot = slot_of(position, state)
     before = np.int64(state.applied[slot, row, column])
     after = min(max(np.int64(state.counts[slot, row, column]), -limit), limit)
@@ -128,11 +153,10 @@ def change_place(
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
         if position < ahead:
             continue
-        coded, projected = state.cursors[plane, CURSOR_CODED], state.cursors[plane, CURSOR_PROJECTED]
-        last_entry = state.cursors[plane, CURSOR_ENTRY]
+        projected, last_entry = state.cursors[plane, CURSOR_PROJECTED], state.cursors[plane, CURSOR_ENTRY]
         for r in range(first_row, last_row):
             for c in range(first_column, last_column):
-                volume = r * shape[1] + c
+                volume = r * operator.shape[1] + c
                 top, left = r * operator.stride, c * operator.stride
                 entry = ((position - ahead) * patch + row - top) * patch + column - left
                 if volume > projected or (volume == projected and entry >= last_entry):
@@ -141,13 +165,11 @@ def change_place(
                     end = (n_bins - ahead) * patch * patch
                     if volume == projected:
                         end = last_entry
-                    first_slot = slot_of(ahead, state)
-                    gather_volume(state.applied, first_slot, end, top, left, patch, state.values[0])
-                state.values[0, entry] = before
-                squares = state.moments[plane, volume, MOMENT_SQUARES]
-                stays = squares != 0 and squares + after * after > before * before
-                if stays and volume < coded and not operator.inverse:
-                    move_volume(plane, volume, entry, after - before, shape, operator, state)
-                else:
-                    change_volume(plane, volume, entry, after - before, shape, operator, state)
+                    gather_volume(
+                        state.applied, slot_of(ahead, state), np.int64(0), end, top, left, patch, values
+                    )
+                    values[end:] = 0
+                values[entry] = before
+                state.entries[0, 0], state.changes[0, 0] = entry, after - before
+                follow_changes(plane, volume, ONCE, NO_THREAD, operator, state)
     state.applied[slot, row, column] = after

@@ -130,9 +130,41 @@ def pool(code: NDArray[np.int32], sign: int, kind: int, pooled: NDArray[np.int32
 
 
 @kernel
+def pool_soft(
+    sign: int,
+    projection: NDArray[np.int32],
+    factor: np.float32,
+    offset: NDArray[np.float32],
+    threshold: np.float32,
+    kind: int,
+    pooled: NDArray[np.int32],
+) -> None:
+    """Same bits as `soft_code` and `pool`, in one run over memory.
+
+    Args:
+        sign: 1 to add the code of a volume, -1 to take it away.
+        projection: `(Kp,)` of the volume; not changed.
+        factor: of the volume, see `gain`.
+        offset: `(Kp,)` of the operator.
+        threshold: of the operator.
+        kind: SOFT or SPLIT.
+        pooled: `(F,)` of the volume's cell, changed.
+    """
+    width = projection.shape[0]
+    sums, sizes = pooled[:width], pooled[width:]
+    split = kind == SPLIT
+    for k in range(width):
+        z = np.float32(projection[k]) * factor - offset[k]
+        code = np.int32(z - min(max(z, -threshold), threshold))
+        sums[k] += sign * code
+        if split:
+            sizes[k] += sign * abs(code)
+
+
+@kernel
 def move_code(
     change: int,
-    column: NDArray[np.int16],
+    column: NDArray[np.int16] | NDArray[np.int32],
     projection: NDArray[np.int32],
     gain_before: np.float32,
     gain_after: np.float32,
@@ -141,14 +173,14 @@ def move_code(
     kind: int,
     pooled: NDArray[np.int32],
 ) -> None:
-    """One entry of a volume changes: projection, soft code and pooled sums follow in one run over memory.
+    """Entries of a volume change: projection, soft code and pooled sums follow in one run over memory.
 
     Same bits as taking the old code away, adding the column, and adding the new code. The old code is
     computed again from the old projection: keeping it would move as many bytes as the projection itself.
 
     Args:
-        change: of the clipped count, 1 or -1.
-        column: `(Kp,)` of the entry.
+        change: 1 to add the column, -1 to subtract it.
+        column: `(Kp,)` int16 of one entry, or the int32 sum of several columns.
         projection: `(Kp,)` of the volume, changed.
         gain_before: of the volume before the change, see `gain`.
         gain_after: and after it.
@@ -178,7 +210,7 @@ def move_code(
 @kernel
 def move_triangle(
     change: int,
-    column: NDArray[np.int16],
+    column: NDArray[np.int16] | NDArray[np.int32],
     projection: NDArray[np.int32],
     gains: tuple[np.float32, np.float32],
     lengths: tuple[np.float32, np.float32],
@@ -192,8 +224,8 @@ def move_triangle(
     """The same as `move_code` for the triangle encoding: distances in one run, the mean of them, codes.
 
     Args:
-        change: of the clipped count, 1 or -1.
-        column: `(Kp,)` of the entry.
+        change: what the column is multiplied with, as for `move_code`.
+        column: `(Kp,)` of one entry, or the sum of several.
         projection: `(Kp,)` of the volume, changed.
         gains: of the volume before the change and after it, see `gain`.
         lengths: `|x|^2` of the whitened volume before the change and after it.

@@ -1,6 +1,7 @@
 """How every kernel is compiled.
 
-Lives here: the decorators of the kernels. Not here: the kernels, and where machine code is kept (`cache`).
+Lives here: the decorators of the kernels and of their vector code. Not here: the kernels, and where machine
+code is kept (`cache`).
 
 Kernels are compiled without numba's reference counts. With them each call of one kernel from another counts
 every array up and down, atomically, in tuples of forty: 480 ns an event, where counting it takes 10. An
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from numba import njit
+from numba.extending import intrinsic
 
 from streamfeat.kernels.cache import keep
 
@@ -35,3 +37,6 @@ inlined = _kept(error_model="numpy", _nrt=False, forceinline=True)
 
 allocating = _kept()
 """The same for what makes arrays, whose references must be counted."""
+
+generated: Callable[[Callable[..., Any]], Callable[..., Any]] = intrinsic
+"""A function whose machine code its body writes, in LLVM's own terms; for `vectors` alone."""

@@ -152,13 +152,10 @@ def time_span(events: Events, height: int, width: int, span: NDArray[np.int64]) 
         How many events are on the sensor.
     """
     n = 0
-    first = last = np.int64(0)
+    first, last = np.int64(0x7FFF_FFFF_FFFF_FFFF), np.int64(-0x7FFF_FFFF_FFFF_FFFF - 1)
     for i in range(len(events)):
         if events[i].x < width and events[i].y < height:
-            t = events[i].t
-            if n == 0:
-                first = last = t
-            first, last = min(first, t), max(last, t)
+            first, last = min(first, events[i].t), max(last, events[i].t)
             n += 1
     if n:
         span[0], span[1] = first, last

@@ -7,19 +7,21 @@ Not here: the codes themselves (`code`, `lasso`), and which volume is encoded wh
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.kernels.code import deviation, pool, soft_code, triangle_code, whitened_square
-from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.code import (
+    deviation,
+    gain,
+    pool,
+    pool_soft,
+    soft_code,
+    triangle_code,
+    whitened_square,
+)
+from streamfeat.kernels.compiled import kernel
 from streamfeat.kernels.lasso import CODE, fix_atoms, lasso_code
 from streamfeat.kernels.layout import CLOCK_PLANE, MOMENT_SQUARES, SPLIT, TRIANGLE, Operator, State
 
 ADD, TAKE = np.int64(1), np.int64(-1)
 """NumPy scalars, because a kernel is compiled once more for each Python literal it is called with."""
-
-
-@inlined
-def lower_part(shape: tuple[int, int], pooling: int) -> int:
-    """The first volume of the second of the two parts of the grid: the lower half of the rows of cells."""
-    return -(-((pooling + 1) // 2 * shape[0]) // pooling) * shape[1]
 
 
 @kernel
@@ -64,14 +66,7 @@ def encode_volume(
 
 @kernel
 def pool_volume(
-    plane: int,
-    row: int,
-    volume: int,
-    sign: int,
-    part: int,
-    shape: tuple[int, int],
-    operator: Operator,
-    state: State,
+    plane: int, row: int, volume: int, sign: int, part: int, operator: Operator, state: State
 ) -> None:
     """Encode one volume, and add it to the pooled sums of its plane or take what was added from them.
 
@@ -80,19 +75,25 @@ def pool_volume(
         row: where its projection is; `volume`, but where volumes share a row.
         volume: which.
         sign: ADD its code as it is now, or TAKE away the code it had.
-        part: whose scratch to use.
-        shape: rows and columns of the grid of volumes.
+        part: whose scratch and sums to use.
         operator: the encoder.
-        state: `pooled`, `atoms`, `encoded` and scratch are changed.
+        state: `pooled` or `partial`, `atoms`, `encoded` and scratch are changed.
     """
     projection, moments = state.projections[plane, row], state.moments[plane, row]
     atoms = state.atoms[plane, row]
     fresh = sign == ADD
-    encode_volume(projection, moments, atoms, fresh, part, operator, state)
     if fresh:
         state.encoded[part] += 1
-    if moments[MOMENT_SQUARES] != 0:
-        pool(state.code[part, 0], sign, operator.kind, state.pooled[plane, state.cells[volume]])
+    cell = state.cells[volume]
+    sums = state.pooled[plane, cell] if part == 0 else state.partial[part - 1, plane, cell]
+    if operator.inverse or operator.kind == TRIANGLE or moments[MOMENT_SQUARES] == 0:
+        encode_volume(projection, moments, atoms, fresh, part, operator, state)
+        if moments[MOMENT_SQUARES] != 0:
+            pool(state.code[part, 0], sign, operator.kind, sums)
+    else:
+        factor = gain(deviation(moments, operator.columns.shape[0], operator.eps), operator)
+        threshold = np.float32(operator.threshold)
+        pool_soft(sign, projection, factor, operator.offset, threshold, operator.kind, sums)
 
 
 @kernel

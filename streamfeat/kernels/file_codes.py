@@ -1,4 +1,4 @@
-"""Codes that occur in files only: Event Stream (`.es`), and ECF, Prophesee's codec of HDF5 chunks.
+"""Codes that occur in files only: Event Stream (`.es`), ECF of Prophesee's HDF5, and numbers in text.
 
 Lives here: one loop for each, bytes in and events out, every read within bounds.
 Not here: headers, blocks and damage (`streamfeat.camera_files`), and packets (`decode`).
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from streamfeat.events import Events
 from streamfeat.kernels.compiled import inlined, kernel
 
-__all__ = ["ECF_PADDING", "decode_ecf", "decode_event_stream", "decode_groups"]
+__all__ = ["ECF_PADDING", "decode_ecf", "decode_event_stream", "decode_groups", "parse_rows"]
 
 ECF_PADDING = 16
 """Bytes that must follow the data of `decode_ecf`, so that a field at its end is read within the array."""
@@ -194,3 +194,85 @@ def decode_groups(data: NDArray[np.uint8], size: int, at: int, bits: int, out: E
                 out[i + k].y = value >> 12 & 0x7FF
         at += bits // 2
     return at
+
+
+@kernel
+def parse_rows(
+    text: NDArray[np.uint8],
+    separator: int,
+    wanted: NDArray[np.int64],
+    digits: NDArray[np.int64],
+    decimals: NDArray[np.int64],
+) -> int:
+    """Read columns of plain decimal numbers, such as `-12` and `0.000125`; empty lines are passed over.
+
+    Args:
+        text: `(n,)` uint8, lines that end with a newline, not changed.
+        separator: the byte between fields, around which blanks mean nothing; 0 for runs of blanks.
+        wanted: `(k,)` int64, positions of the fields to read, ascending; others may hold anything.
+        digits: `(k, rows)` int64, changed: each number without its point.
+        decimals: `(k, rows)` int64, changed: how many of its digits are behind the point.
+
+    Returns:
+        The number of rows, or -1 where a field is missing or is no such number, has more than 18 digits, or
+        has a point and more than the 53 bits of which a float holds every whole number.
+    """
+    n = at = 0
+    end = len(text)
+    while at < end:
+        while at < end and (text[at] == 32 or text[at] == 9):
+            at += 1
+        if at >= end or text[at] == 10:
+            at += 1
+            continue
+        if n >= digits.shape[1]:
+            return -1
+        k = field = 0
+        while at < end and text[at] != 10:
+            if k < len(wanted) and field == wanted[k]:
+                is_negative = text[at] == 45
+                if text[at] == 45 or text[at] == 43:
+                    at += 1
+                number, n_digits, n_decimals = np.int64(0), 0, 0
+                has_point = False
+                while at < end:
+                    if text[at] == 46 and not has_point:
+                        has_point = True
+                    elif 48 <= text[at] <= 57:
+                        number = number * 10 + (np.int64(text[at]) - 48)
+                        n_digits += 1
+                        n_decimals += has_point
+                        if n_digits > 18:
+                            return -1
+                    else:
+                        break
+                    at += 1
+                if n_digits == 0 or (n_decimals > 0 and number >= 1 << 53):
+                    return -1
+                digits[k, n] = -number if is_negative else number
+                decimals[k, n] = n_decimals
+                k += 1
+            else:
+                while at < end and text[at] != 10 and text[at] != separator:
+                    if separator == 0 and (text[at] == 32 or text[at] == 9):
+                        break
+                    at += 1
+            blanks = at
+            while at < end and (text[at] == 32 or text[at] == 9):
+                at += 1
+            if at < end and text[at] != 10:
+                if separator == 0:
+                    if at == blanks:
+                        return -1
+                elif text[at] == separator:
+                    at += 1
+                    while at < end and (text[at] == 32 or text[at] == 9):
+                        at += 1
+                else:
+                    return -1
+            field += 1
+        if k < len(wanted):
+            return -1
+        at += 1
+        n += 1
+    return n

@@ -17,13 +17,11 @@ from streamfeat.kernels.layout import (
     CLOCK_START,
     CURSOR_CODED,
     CURSOR_PROJECTED,
-    PARTS,
     TALLY_EVENTS,
     Operator,
     State,
 )
-from streamfeat.kernels.planes import complete, look_ahead
-from streamfeat.kernels.update import finish
+from streamfeat.kernels.planes import fill_plane, look_ahead
 
 PROJECTED_BY, CODED_FROM, CODED_BY = 0.9, 0.85, 0.975
 """Shares of a bin: when all projections of the next bin shall be there, and between when all codes."""
@@ -39,7 +37,6 @@ def follow_event(
     y: int,
     p: int,
     t: int,
-    shape: tuple[int, int],
     operator: Operator,
     state: State,
 ) -> None:
@@ -52,46 +49,41 @@ def follow_event(
         y: row in pixels, any value.
         p: polarity, any value.
         t: stream time in microseconds, any value.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: all of it may be changed. Nothing may be on the touched stack.
     """
-    n_volumes = shape[0] * shape[1]
+    n_volumes = operator.shape[0] * operator.shape[1]
     position, row, column = count_event(x, y, p, t, operator, state)
     if state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED] < n_volumes:
-        for part in range(PARTS):
-            complete(part, shape, operator, state)
-        finish(shape, state)
+        fill_plane(operator, state)
     if position != UNCHANGED:
-        change_place(position, row, column, shape, operator, state)
+        change_place(position, row, column, operator, state)
     if state.cursors.shape[0] > 1:
         share = min(max((t - state.clock[CLOCK_START]) / operator.bin_us, 0.0), 1.0)
         projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
         coded = min(n_volumes, int(n_volumes * max(share - CODED_FROM, 0.0) / (CODED_BY - CODED_FROM)))
         coming = state.cursors[1 - state.clock[CLOCK_PLANE]]
         behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
-        look_ahead(projected, coded, SLICE + HASTE * behind // n_volumes, shape, operator, state)
+        look_ahead(projected, coded, SLICE + HASTE * behind // n_volumes, operator, state)
 
 
 @kernel
-def follow(events: Events, shape: tuple[int, int], operator: Operator, state: State) -> None:
+def follow(events: Events, operator: Operator, state: State) -> None:
     """Follow every event of a batch, one by one.
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: as for `follow_event`.
     """
     for i in range(events.shape[0]):
         event = events[i]
-        follow_event(event.x, event.y, event.p, event.t, shape, operator, state)
+        follow_event(event.x, event.y, event.p, event.t, operator, state)
 
 
 @kernel
 def trace(
     events: Events,
-    shape: tuple[int, int],
     operator: Operator,
     state: State,
     features: NDArray[np.float32],
@@ -101,7 +93,6 @@ def trace(
 
     Args:
         events: `(n,)` EVENT_DTYPE, any content; not changed.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: as for `follow_event`.
         features: `(n, 4 K)` or `(n, 8 K)`, overwritten.
@@ -109,6 +100,6 @@ def trace(
     """
     for i in range(events.shape[0]):
         event = events[i]
-        follow_event(event.x, event.y, event.p, event.t, shape, operator, state)
+        follow_event(event.x, event.y, event.p, event.t, operator, state)
         read_features(operator, state, features[i])
         accepted[i] = state.tally[TALLY_EVENTS]

@@ -1,7 +1,7 @@
 """From events to counts: a few nanoseconds an event, whatever the number of filters.
 
 Lives here: the only code that looks at single events, and that moves the ring of bins on.
-Not here: projections and codes, which are brought up to date when somebody reads (`update`).
+Not here: projections and codes, which are brought up to date at an emission (`update`).
 
 Every event is checked before it indexes anything: a batch from a hostile source can only be counted
 as rejected. The check is inside the loop because it costs less there than a vectorised pass before it.
@@ -9,7 +9,7 @@ as rejected. The check is inside the loop because it costs less there than a vec
 
 import numpy as np
 
-from streamfeat.events import Events
+from streamfeat.events import TIME_LIMIT, Events
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
@@ -61,6 +61,13 @@ def advance_to_bin(new: int, operator: Operator, state: State) -> None:
 
 
 @inlined
+def is_valid(x: int, y: int, p: int, t: int, state: State) -> bool:
+    """Whether an event may be counted: the rule of `events.is_valid`, which describes it."""
+    inside = x < state.ring_columns.shape[0] and y < state.ring_rows.shape[0]
+    return inside and p >> 1 == 0 and -TIME_LIMIT < t < TIME_LIMIT
+
+
+@inlined
 def count_event(x: int, y: int, p: int, t: int, operator: Operator, state: State) -> tuple[int, int, int]:
     """Count one event in its pixel and bin.
 
@@ -78,8 +85,7 @@ def count_event(x: int, y: int, p: int, t: int, operator: Operator, state: State
     """
     counts, clock, tally = state.counts, state.clock, state.tally
     n_bins, limit = counts.shape[0], operator.max_count
-    inside = x < state.ring_columns.shape[0] and y < state.ring_rows.shape[0]
-    if not inside or p < 0 or p > 1 or t <= BEFORE_TIME or t >= -BEFORE_TIME:
+    if not is_valid(x, y, p, t, state):
         tally[TALLY_REJECTED] += 1
         return UNCHANGED, 0, 0
     position = n_bins - 1
@@ -113,12 +119,12 @@ def slot_of(position: int, state: State) -> int:
 @inlined
 def start_of_bin(state: State) -> int:
     """When the current bin began; before all time, later than any event."""
-    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] > BEFORE_TIME else -BEFORE_TIME
+    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] > BEFORE_TIME else TIME_LIMIT
 
 
 @kernel
 def count_events(events: Events, operator: Operator, state: State) -> None:
-    """Count every event of a batch, and note the entries that changed for the next reading.
+    """Count every event of a batch, and note the entries that changed for the next emission.
 
     Same as `count_event` on each; the events of the current bin, which are nearly all, go a shorter way.
 
@@ -136,8 +142,7 @@ def count_events(events: Events, operator: Operator, state: State) -> None:
     for i in range(events.shape[0]):
         event = events[i]
         x, y, p, t = event.x, event.y, event.p, event.t
-        sound = x < columns.shape[0] and y < rows.shape[0] and p >> 1 == 0 and BEFORE_TIME < t < -BEFORE_TIME
-        if sound and np.uint64(t - start) < np.uint64(operator.bin_us):
+        if is_valid(x, y, p, t, state) and np.uint64(t - start) < np.uint64(operator.bin_us):
             # Unsigned, or every index would be tested for being below zero.
             place = np.uint64(first + rows[y] * row_length + columns[x])
             before = counts[place]

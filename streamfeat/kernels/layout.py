@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.events import TIME_LIMIT
+
 SOFT, SPLIT, TRIANGLE = 0, 1, 2
 FEATURE_ENCODINGS = {"soft": SOFT, "split": SPLIT, "triangle": TRIANGLE}
 
@@ -63,6 +65,8 @@ class Operator(NamedTuple):
     """`(K, K)`: inner products of the atoms; empty unless `inverse`."""
     gap: float
     """The lasso stops at this duality gap, relative to `1/2 |x|^2`."""
+    shape: tuple[int, int] = (0, 0)
+    """Rows and columns of the grid of volumes; of the sensor, not of the model, which has none."""
 
 
 class State(NamedTuple):
@@ -74,14 +78,16 @@ class State(NamedTuple):
     plane in order, first their projections, then their codes; `cursors` says how far it has come. Invariant:
     a row whose sum of squares is zero has moments and projection zero.
 
-    Two parts of the grid share no pooled sum, so two threads can work on one each: what is scratch is there
-    once for each of the two `PARTS`.
+    Threads share the volumes of a large emission in contiguous parts, `N` of them. No two write to one row:
+    scratch and sums are there once for each part.
     """
 
     counts: NDArray[np.int32]
     """`(T, H, W)`: signed counts, one slot a bin; bin `b` lives in slot `b % T`."""
     applied: NDArray[np.int16]
     """`(T, H, W)`: the clipped counts that planes stand for."""
+    news: NDArray[np.int16]
+    """`(T, H, W)`: clipped counts less `applied`, while an update is under way; else zero."""
     touched: NDArray[np.int32]
     """`(T * H * W + 1,)`: flat indices of the entries whose clipped count changed since; a stack, with room
     for one that is written and not kept."""
@@ -104,7 +110,7 @@ class State(NamedTuple):
     tally: NDArray[np.int64]
     """`(5,)`: see the TALLY_* slots."""
     encoded: NDArray[np.int64]
-    """`(PARTS,)`: volumes encoded so far, a measure of the work done."""
+    """`(N,)`: volumes encoded so far, a measure of the work done."""
     projections: NDArray[np.int32]
     """`(planes, V, Kp)`: `q` of every volume."""
     moments: NDArray[np.int64]
@@ -115,30 +121,35 @@ class State(NamedTuple):
     pooled: NDArray[np.int32]
     """`(planes, cells, F)`: fixed-point codes summed over each cell. `F` is Kp, or 2 Kp for SPLIT: sums of
     codes, then of their absolute values (the positive and negative parts are half the sum and difference)."""
+    partial: NDArray[np.int32]
+    """`(N - 1, planes, cells, F)`: what other parts than the first add to `pooled`, until all are done; then
+    zero."""
     cells: NDArray[np.int32]
     """`(V,)`: cell of each volume."""
+    lines: NDArray[np.int32]
+    """`(2, W + 1)`: scratch of the search for volumes that are not empty."""
+    crowds: NDArray[np.int32]
+    """`(H + 1, columns of the grid)`: scratch of the same, pixels that are not empty in each row of the ring
+    between the sides of each volume."""
     dirty: NDArray[np.int32]
-    """`(planes * V,)`: volumes to encode again, by `plane * V + volume`; a stack."""
+    """`(planes * V,)`: volumes to work on, by `plane * V + volume`; a stack."""
     is_dirty: NDArray[np.uint8]
-    """`(planes * V,)`: whether a volume is on that stack."""
+    """`(planes * V,)`: whether a volume is on that stack because entries of it changed."""
     code: NDArray[np.int32]
-    """`(PARTS, 2, Kp)`: scratch, fixed-point codes of one volume."""
+    """`(N, 3, Kp)`: scratch, fixed-point codes of one volume, and the change of a projection."""
     work: NDArray[np.float64]
-    """`(PARTS, 5, Kp)`: scratch of the lasso."""
+    """`(N, 5, Kp)`: scratch of the lasso."""
     active: NDArray[np.int64]
-    """`(PARTS, Kp)`: scratch of the lasso, indices of atoms."""
+    """`(N, Kp)`: scratch of the lasso, indices of atoms."""
     corners: NDArray[np.float32]
-    """`(PARTS, K * Kp)`: scratch of the lasso, a part of the Gram matrix; in memory as far as used."""
+    """`(N, K * Kp)`: scratch of the lasso, a part of the Gram matrix; in memory as far as used."""
     values: NDArray[np.int16]
-    """`(PARTS, d)`: scratch, the entries of one volume."""
+    """`(N, 2, >= d)`: scratch, the entries of one volume and their changes; whole vectors of 64."""
     entries: NDArray[np.int32]
-    """`(PARTS, d)`: scratch, the entries of one volume that change."""
+    """`(N, d + 1)`: scratch, the entries of one volume that change; the last is room for half a pair."""
     changes: NDArray[np.int16]
-    """`(PARTS, d)`: scratch, by how much they change."""
+    """`(N, d + 1)`: scratch, by how much they change."""
 
-
-PARTS = 2
-"""The upper and the lower half of the rows of cells."""
 
 CLOCK_NOW, CLOCK_START, CLOCK_TOUCHED, CLOCK_ORIGIN, CLOCK_PLANE, CLOCK_DIRTY, CLOCK_SLOT = range(7)
 """Current bin; when it began, in us; height of the touched stack; time of bin 0 in us; current plane; height
@@ -154,5 +165,5 @@ moved on by."""
 
 MOMENT_SUM, MOMENT_SQUARES, MOMENT_QUADRATIC, MOMENT_LINEAR = range(4)
 
-BEFORE_TIME = -(1 << 62)
-"""The current bin of an engine that has seen nothing; also bounds the times that are accepted."""
+BEFORE_TIME = -TIME_LIMIT
+"""The current bin of an engine that has seen nothing, and when it began."""

@@ -1,10 +1,11 @@
 """Planes: all volumes at one bin, current or the next.
 
-Lives here: letting volumes enter a plane, all at once (`complete`) or in bounded slices (`look_ahead`).
+Lives here: letting volumes enter a plane, all at once (`fill_plane`, or its steps, of which `complete` may
+run on several threads) or in bounded slices (`look_ahead`).
 Not here: changes of volumes that are in a plane (`update`, `follow`), and the swap (`ingest`).
 
 A bin boundary moves every entry of every volume by one bin, so all that is not empty must be projected
-again. Done when somebody next reads, that is the longest wait of the whole system. Looking ahead spreads
+again. Done at the next emission, that is the longest wait of the whole system. Looking ahead spreads
 it over the bin before: what volumes will be after the boundary is prepared beside what they are now.
 A volume enters in two steps. Once it is projected an event costs it one more column; only once it is coded
 does it cost a second code, so codes come last, shortly before the boundary.
@@ -19,12 +20,14 @@ complete when its bin begins is completed then.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, lower_part, pool_volume
+from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.encode import ADD, pool_volume
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.lasso import respond
 from streamfeat.kernels.layout import (
+    CLOCK_DIRTY,
     CLOCK_PLANE,
     CURSOR_CODED,
     CURSOR_ENTRY,
@@ -33,10 +36,13 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
-from streamfeat.kernels.volume import change_entries, gather_volume, list_filled
+from streamfeat.kernels.volume import add_moments, change_moments, gather_volume, list_entries, sum_columns
 
 CURRENT, NEXT = np.int64(0), np.int64(1)
 """Bins by which a plane is ahead."""
+
+FIRST, ALONE = np.int64(0), np.int64(1)
+"""The first part of an update, and how many there are where no thread shares it."""
 
 CODE_COST = 6
 """Columns that could be added while one volume is encoded and pooled."""
@@ -44,15 +50,7 @@ CODE_COST = 6
 
 @kernel
 def project_volume(
-    plane: int,
-    volume: int,
-    ahead: int,
-    start: int,
-    most: int,
-    part: int,
-    shape: tuple[int, int],
-    operator: Operator,
-    state: State,
+    plane: int, volume: int, ahead: int, start: int, most: int, part: int, operator: Operator, state: State
 ) -> tuple[int, int]:
     """Let entries of a volume into its projection in a plane, in order.
 
@@ -60,10 +58,9 @@ def project_volume(
         plane: which plane.
         volume: which volume. Where the plane has a single row, volumes share it.
         ahead: CURRENT for the current bin, NEXT for the bin after it.
-        start: first entry that is not in yet; from 0 on, what the row held before is cleared.
+        start: first entry that is not in yet; from 0 on, what the row held before is overwritten.
         most: entries that are not zero to let in at most.
         part: whose scratch to use.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: the row and scratch are changed.
 
@@ -72,39 +69,42 @@ def project_volume(
     """
     row = min(volume, state.projections.shape[1] - 1)
     projection, moments = state.projections[plane, row], state.moments[plane, row]
-    values, entries, changes = state.values[part], state.entries[part], state.changes[part]
-    if start == 0 and moments[MOMENT_SQUARES] != 0:
-        projection[:] = 0
-        moments[:] = 0
-    n_bins, patch = state.applied.shape[0], operator.patch
+    values, entries, changes = state.values[part, 0], state.entries[part], state.changes[part]
+    n_bins, patch, columns = state.applied.shape[0], operator.patch, operator.shape[1]
     end = (n_bins - ahead) * patch * patch
-    top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
-    first_slot = slot_of(ahead, state)
-    n, following = list_filled(
-        state.applied, first_slot, start, end, most, top, left, patch, entries, changes
-    )
-    if operator.quadratic.shape[0]:
-        gather_volume(state.applied, first_slot, start, top, left, patch, values)
+    top, left = volume // columns * operator.stride, volume % columns * operator.stride
+    first = np.int64(0) if operator.quadratic.shape[0] else start
+    gather_volume(state.applied, slot_of(ahead, state), first, end, top, left, patch, values)
+    n, following = list_entries(values, start, end, entries, changes), end
+    if n > most:
+        n, following = most, np.int64(entries[most])
+    if start == 0:
+        if n > 0 or moments[MOMENT_SQUARES] != 0:
+            sum_columns(n, entries, changes, operator.columns, projection)
+        moments[:] = 0
     else:
-        for i in range(n):
-            values[entries[i]] = 0
-    change_entries(n, entries, changes, values, operator, projection, moments)
+        sums = state.code[part, 2]
+        sum_columns(n, entries, changes, operator.columns, sums)
+        for k in range(sums.shape[0]):
+            projection[k] += sums[k]
+    if operator.quadratic.shape[0]:
+        values[start:] = 0
+        change_moments(n, entries, changes, values, operator, moments)
+    else:
+        add_moments(n, changes, moments)
     return n, following
 
 
 @kernel
-def enter_code(
-    plane: int, volume: int, part: int, shape: tuple[int, int], operator: Operator, state: State
-) -> bool:
+def enter_code(plane: int, volume: int, part: int, operator: Operator, state: State) -> bool:
     """Encode a volume that was projected, and add it to the pooled sums of its plane.
 
     Args:
         plane: which plane.
         volume: which volume. Where the plane has a single row, volumes share it.
-        part: whose scratch to use.
-        shape: rows and columns of the grid of volumes.
+        part: whose scratch and sums to use.
         operator: the encoder.
-        state: `atoms`, `pooled`, `encoded` and scratch are changed.
+        state: `atoms`, `pooled` or `partial`, `encoded` and scratch are changed.
 
     Returns:
         whether the volume had a count, and so a code.
@@ -115,42 +115,134 @@ def enter_code(
         return False
     if operator.inverse:
         respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
-    pool_volume(plane, row, volume, ADD, part, shape, operator, state)
+    pool_volume(plane, row, volume, ADD, part, operator, state)
     return True
 
 
 @kernel
-def complete(part: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
-    """Let all volumes of one part of the grid that are missing enter the current plane.
+def count_filled(
+    ring: NDArray[np.int16], stride: int, patch: int, lines: NDArray[np.int32], crowds: NDArray[np.int32]
+) -> None:
+    """Count the pixels that are not empty in each row of the ring, between the sides of each volume.
 
     Args:
-        part: 0 for the upper half, 1 for the lower. The cursors stay, for the other part to see.
-        shape: rows and columns of the grid of volumes.
-        operator: the encoder.
-        state: the plane and scratch of the part are changed.
+        ring: `(T, H, W)` clipped counts; a pixel is empty if all of its bins are zero.
+        stride: pixels between neighbouring volumes.
+        patch: columns of a volume.
+        lines: `(2, W + 1)` scratch.
+        crowds: `(>= H, columns of the grid)`, overwritten in its first `H` rows.
     """
-    plane = state.clock[CLOCK_PLANE]
-    cursors, half = state.cursors[plane], lower_part(shape, operator.pooling)
-    first, last = (0, half) if part == 0 else (half, shape[0] * shape[1])
-    for volume in range(max(first, cursors[CURSOR_CODED]), last):
-        if volume >= cursors[CURSOR_PROJECTED]:
-            start = cursors[CURSOR_ENTRY] if volume == cursors[CURSOR_PROJECTED] else np.int64(0)
-            most = state.values.shape[1]
-            project_volume(plane, volume, CURRENT, start, most, part, shape, operator, state)
-        enter_code(plane, volume, part, shape, operator, state)
+    filled, before = lines[0], lines[1]
+    n_bins, height, width = ring.shape
+    before[0] = 0
+    for row in range(height):
+        filled[:] = 0
+        for slot in range(n_bins):
+            pixels = ring[slot, row]
+            for column in range(width):
+                filled[column] |= pixels[column]
+        total = np.int32(0)
+        for column in range(width):
+            total += np.int32(filled[column] != 0)
+            before[column + 1] = total
+        crowd = crowds[row]
+        for c in range(crowd.shape[0]):
+            crowd[c] = before[c * stride + patch] - before[c * stride]
 
 
 @kernel
-def look_ahead(
-    projected: int, coded: int, budget: int, shape: tuple[int, int], operator: Operator, state: State
-) -> int:
+def list_missing(operator: Operator, state: State) -> None:
+    """Put every volume that has to enter the current plane on the dirty stack, and no empty one.
+
+    An empty volume has to, if its row is of an earlier bin and was not empty then; and under the inverse
+    formulation, where it may be one whose code has to be forgotten.
+
+    Args:
+        operator: the encoder.
+        state: `dirty`, the height of that stack and scratch are changed.
+    """
+    plane, columns = state.clock[CLOCK_PLANE], operator.shape[1]
+    n_volumes, n, coded = operator.shape[0] * columns, 0, state.cursors[plane, CURSOR_CODED]
+    if coded < n_volumes:
+        count_filled(state.applied, operator.stride, operator.patch, state.lines, state.crowds)
+        moments, is_shared = state.moments[plane], state.moments.shape[1] < n_volumes
+        crowd = state.crowds[state.crowds.shape[0] - 1]
+        for r in range(coded // columns, operator.shape[0]):
+            crowd[:] = 0
+            for row in range(r * operator.stride, r * operator.stride + operator.patch):
+                counts = state.crowds[row]
+                for c in range(columns):
+                    crowd[c] += counts[c]
+            for c in range(max(coded - r * columns, 0), columns):
+                volume = r * columns + c
+                was_filled = not is_shared and moments[volume, MOMENT_SQUARES] != 0
+                if crowd[c] != 0 or was_filled or operator.inverse:
+                    state.dirty[n] = volume
+                    n += 1
+    state.clock[CLOCK_DIRTY] = n
+
+
+@inlined
+def share_of(part: int, parts: int, state: State) -> tuple[int, int]:
+    """First and last plus one of the volumes on the dirty stack that one of some parts works on."""
+    n = state.clock[CLOCK_DIRTY]
+    return n * part // parts, n * (part + 1) // parts
+
+
+@kernel
+def complete(part: int, parts: int, operator: Operator, state: State) -> None:
+    """Let one part of the volumes that `list_missing` found enter the current plane.
+
+    Args:
+        part: which. The cursors stay, for the other parts to see.
+        parts: of how many.
+        operator: the encoder.
+        state: rows of these volumes, and sums and scratch of the part, are changed.
+    """
+    plane = state.clock[CLOCK_PLANE]
+    cursors = state.cursors[plane]
+    first, last = share_of(part, parts, state)
+    for i in range(first, last):
+        volume = np.int64(state.dirty[i])
+        if volume >= cursors[CURSOR_PROJECTED]:
+            start = cursors[CURSOR_ENTRY] if volume == cursors[CURSOR_PROJECTED] else np.int64(0)
+            most = operator.columns.shape[0]
+            project_volume(plane, volume, CURRENT, start, most, part, operator, state)
+        enter_code(plane, volume, part, operator, state)
+
+
+@kernel
+def finish(parts: int, operator: Operator, state: State) -> None:
+    """All parts of an update are done: their sums are added up, and the current plane is complete."""
+    volumes = operator.shape[0] * operator.shape[1]
+    for part in range(parts - 1):
+        for plane in range(state.pooled.shape[0]):
+            for cell in range(state.pooled.shape[1]):
+                sums, more = state.pooled[plane, cell], state.partial[part, plane, cell]
+                for k in range(sums.shape[0]):
+                    sums[k] += more[k]
+                    more[k] = 0
+    cursors = state.cursors[state.clock[CLOCK_PLANE]]
+    cursors[CURSOR_CODED], cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY] = volumes, volumes, 0
+    state.clock[CLOCK_DIRTY] = 0
+
+
+@kernel
+def fill_plane(operator: Operator, state: State) -> None:
+    """Let all volumes that are missing enter the current plane."""
+    list_missing(operator, state)
+    complete(FIRST, ALONE, operator, state)
+    finish(ALONE, operator, state)
+
+
+@kernel
+def look_ahead(projected: int, coded: int, budget: int, operator: Operator, state: State) -> int:
     """Let volumes enter the plane that looks ahead, as far as asked or until the budget is spent.
 
     Args:
         projected: volumes that shall have a projection.
         coded: volumes that shall have a code.
         budget: columns that may be added; encoding a volume counts for `CODE_COST`.
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: the other plane and scratch are changed; nothing happens if there is one plane only, or the
             current one is not complete.
@@ -158,7 +250,7 @@ def look_ahead(
     Returns:
         what is left of the budget.
     """
-    current, volumes = state.clock[CLOCK_PLANE], shape[0] * shape[1]
+    current, volumes = state.clock[CLOCK_PLANE], operator.shape[0] * operator.shape[1]
     if state.cursors.shape[0] == 1 or state.cursors[current, CURSOR_CODED] < volumes:
         return budget
     plane = 1 - current
@@ -168,7 +260,7 @@ def look_ahead(
         end = operator.columns.shape[0]
         # What is empty now will be empty then.
         if start > 0 or state.moments[current, volume, MOMENT_SQUARES] or moments[volume, MOMENT_SQUARES]:
-            n, start = project_volume(plane, volume, NEXT, start, budget, part, shape, operator, state)
+            n, start = project_volume(plane, volume, NEXT, start, budget, part, operator, state)
             budget -= 1 + n
             end -= operator.patch * operator.patch
         else:
@@ -176,6 +268,6 @@ def look_ahead(
         cursors[CURSOR_PROJECTED] += start == end
         cursors[CURSOR_ENTRY] = 0 if start == end else start
     while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
-        budget -= CODE_COST * enter_code(plane, cursors[CURSOR_CODED], part, shape, operator, state)
+        budget -= CODE_COST * enter_code(plane, cursors[CURSOR_CODED], part, operator, state)
         cursors[CURSOR_CODED] += 1
     return budget

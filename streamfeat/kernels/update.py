@@ -1,138 +1,133 @@
-"""Reading after any number of events: planes brought up to date with the counts.
+"""An emission after any number of events: planes brought up to date with the counts.
 
-Lives here: applying what has changed since the last reading. Each entry costs its net change only, and
+Lives here: applying what has changed since the last emission. Each entry costs its net change only, and
 each changed volume is encoded once, however many events fell on it.
 Not here: what a volume's sums are (`volume`), what its code is (`encode`), single events (`follow`).
 
-In four steps, because two of them can be done for both parts of the grid at once, by two threads:
-`mark_dirty`, `renew` each part, `settle`, `complete` each part.
+In steps, because threads can share two of them: `mark_dirty`, `renew` each part, `settle`, `list_missing`,
+`complete` each part, `finish`.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.kernels.compiled import kernel
-from streamfeat.kernels.encode import ADD, TAKE, lower_part, pool_volume, read_features
+from streamfeat.kernels.change import follow_changes
+from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.layout import (
     CLOCK_DIRTY,
     CLOCK_PLANE,
     CLOCK_SLOT,
     CLOCK_TOUCHED,
-    CURSOR_CODED,
     CURSOR_ENTRY,
     CURSOR_PROJECTED,
-    PARTS,
     Operator,
     State,
 )
-from streamfeat.kernels.planes import complete
-from streamfeat.kernels.volume import change_entries, gather_volume, list_changed
+from streamfeat.kernels.planes import ALONE, FIRST, fill_plane, share_of
+from streamfeat.kernels.volume import gather_volume, list_entries
 
 
 @kernel
-def mark_dirty(shape: tuple[int, int], operator: Operator, state: State) -> None:
+def mark_dirty(operator: Operator, state: State) -> None:
     """Put every volume of every plane that covers a touched entry on the dirty stack.
 
     Args:
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
-        state: `dirty`, `is_dirty`, `touched_slots` and the height of the dirty stack are changed.
+        state: `news`, `dirty`, `is_dirty`, `touched_slots` and the height of the dirty stack are changed.
     """
     n_bins, height, width = state.counts.shape
     applied, counts, limit = state.applied.reshape(-1), state.counts.reshape(-1), operator.max_count
-    n_volumes, patch = shape[0] * shape[1], operator.patch
+    n_volumes, patch, columns = operator.shape[0] * operator.shape[1], operator.patch, operator.shape[1]
+    news, is_dirty, stride = state.news.reshape(-1), state.is_dirty, operator.stride
     state.touched_slots[:] = 0
-    n_dirty = 0
     for i in range(state.clock[CLOCK_TOUCHED]):
         place = state.touched[i]
-        if applied[place] == min(max(counts[place], -limit), limit):
+        change = min(max(np.int64(counts[place]), -limit), limit) - applied[place]
+        if change == 0:
             continue
-        slot = place // (height * width)
+        news[place] = change
+        line = place // width
+        slot, row, column = line // height, line % height, place - line * width
         state.touched_slots[slot] = 1
-        row, column = place // width % height, place % width
-        first_row, last_row = state.volume_rows[row]
-        first_column, last_column = state.volume_columns[column]
+        first_row, last_row = state.volume_rows[row, 0], state.volume_rows[row, 1]
+        first_column, last_column = state.volume_columns[column, 0], state.volume_columns[column, 1]
         for plane in range(state.cursors.shape[0]):
             # The oldest bin of the window is at position 0 of a volume.
-            position = (slot - state.clock[CLOCK_SLOT] - 1) % n_bins - np.int64(
-                plane != state.clock[CLOCK_PLANE]
-            )
+            position = slot - state.clock[CLOCK_SLOT] - 1
+            position += n_bins if position < 0 else 0
+            position -= np.int64(plane != state.clock[CLOCK_PLANE])
             last, last_entry = state.cursors[plane, CURSOR_PROJECTED], state.cursors[plane, CURSOR_ENTRY]
-            if position < 0:
+            if position < 0 or last + last_entry == 0:
                 continue
             for r in range(first_row, last_row):
+                line_entry = (position * patch + row - r * stride) * patch + column
                 for c in range(first_column, last_column):
-                    volume = r * shape[1] + c
-                    index = plane * n_volumes + volume
-                    top, left = r * operator.stride, c * operator.stride
-                    entry = (position * patch + row - top) * patch + column - left
-                    inside = volume < last or (volume == last and entry < last_entry)
-                    if inside and state.is_dirty[index] == 0:
-                        state.is_dirty[index] = 1
-                        state.dirty[n_dirty] = index
-                        n_dirty += 1
+                    volume = r * columns + c
+                    inside = volume < last or (volume == last and line_entry - c * stride < last_entry)
+                    is_dirty[plane * n_volumes + volume] |= inside
+    # Listed in the order of the volumes: neighbours in memory are neighbours on the sensor.
+    n_dirty = 0
+    for index in range(is_dirty.shape[0] if state.clock[CLOCK_TOUCHED] else 0):
+        state.dirty[n_dirty] = index
+        n_dirty += np.int64(is_dirty[index])
     state.clock[CLOCK_DIRTY] = n_dirty
 
 
+@inlined
+def touched_bins(state: State) -> tuple[int, int]:
+    """First and last plus one of the bins of the window in which an entry changed, oldest first."""
+    n_bins = state.counts.shape[0]
+    first, last = n_bins, 0
+    for position in range(n_bins):
+        if state.touched_slots[slot_of(position, state)]:
+            first, last = min(first, position), position + 1
+    return first, last
+
+
 @kernel
-def renew(part: int, shape: tuple[int, int], operator: Operator, state: State) -> None:
-    """Let the dirty volumes of one part of the grid follow the counts.
+def renew(part: int, parts: int, operator: Operator, state: State) -> None:
+    """Let one part of the dirty volumes follow the counts.
 
     Args:
-        part: 0 for the upper half, 1 for the lower.
-        shape: rows and columns of the grid of volumes.
+        part: which.
+        parts: of how many.
         operator: the encoder.
-        state: rows, pooled sums and scratch of the part are changed.
+        state: rows of these volumes, and sums and scratch of the part, are changed.
     """
-    n_bins, patch, n_volumes = state.counts.shape[0], operator.patch, shape[0] * shape[1]
-    values, entries, changes = state.values[part], state.entries[part], state.changes[part]
-    lower = lower_part(shape, operator.pooling)
-    for i in range(state.clock[CLOCK_DIRTY]):
-        index = np.int64(state.dirty[i])
-        plane, volume = index // n_volumes, index % n_volumes
-        if part != np.int64(volume >= lower):
-            continue
-        cursors = state.cursors[plane]
+    n_bins, patch, columns = state.counts.shape[0], operator.patch, operator.shape[1]
+    values, news, n_volumes = state.values[part, 0], state.values[part, 1], operator.shape[0] * columns
+    first_bin, last_bin = touched_bins(state)
+    first, last = share_of(part, parts, state)
+    for i in range(first, last):
+        plane, volume = np.int64(state.dirty[i]) // n_volumes, np.int64(state.dirty[i]) % n_volumes
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
         end = (n_bins - ahead) * patch * patch
-        if volume == cursors[CURSOR_PROJECTED]:
-            end = cursors[CURSOR_ENTRY]
-        top, left = volume // shape[1] * operator.stride, volume % shape[1] * operator.stride
-        first_slot = slot_of(ahead, state)
+        if volume == state.cursors[plane, CURSOR_PROJECTED]:
+            end = state.cursors[plane, CURSOR_ENTRY]
+        top, left = volume // columns * operator.stride, volume % columns * operator.stride
+        slot = slot_of(ahead, state)
+        start, stop = max(first_bin - ahead, 0) * patch * patch, min(end, (last_bin - ahead) * patch * patch)
+        gather_volume(state.news, slot, start, stop, top, left, patch, news)
         if operator.quadratic.shape[0]:
-            gather_volume(state.applied, first_slot, end, top, left, patch, values)
-        n = list_changed(
-            state.counts,
-            state.applied,
-            operator.max_count,
-            state.touched_slots,
-            first_slot,
-            end,
-            top,
-            left,
-            patch,
-            entries,
-            changes,
-            values,
-        )
-        coded = volume < cursors[CURSOR_CODED]
-        if coded:
-            pool_volume(plane, volume, volume, TAKE, part, shape, operator, state)
-        projection, moments = state.projections[plane, volume], state.moments[plane, volume]
-        change_entries(n, entries, changes, values, operator, projection, moments)
-        if coded:
-            pool_volume(plane, volume, volume, ADD, part, shape, operator, state)
+            gather_volume(state.applied, slot, np.int64(0), end, top, left, patch, values)
+            values[end:] = 0
+        else:
+            gather_volume(state.applied, slot, start, stop, top, left, patch, values)
+        n = list_entries(news, start, stop, state.entries[part], state.changes[part])
+        follow_changes(plane, volume, n, part, operator, state)
 
 
 @kernel
-def settle(operator: Operator, state: State) -> None:
+def settle(state: State) -> None:
     """The planes stand for the counts as they are now: both stacks are empty."""
-    flags, applied, counts = state.is_touched.reshape(-1), state.applied.reshape(-1), state.counts.reshape(-1)
+    flags, applied, news = state.is_touched.reshape(-1), state.applied.reshape(-1), state.news.reshape(-1)
     for i in range(state.clock[CLOCK_TOUCHED]):
         place = state.touched[i]
         flags[place] = 0
-        applied[place] = min(max(counts[place], -operator.max_count), operator.max_count)
+        applied[place] += news[place]
+        news[place] = 0
     for i in range(state.clock[CLOCK_DIRTY]):
         state.is_dirty[state.dirty[i]] = 0
     state.clock[CLOCK_TOUCHED] = 0
@@ -140,41 +135,27 @@ def settle(operator: Operator, state: State) -> None:
 
 
 @kernel
-def finish(shape: tuple[int, int], state: State) -> None:
-    """Both parts of the current plane are complete."""
-    cursors = state.cursors[state.clock[CLOCK_PLANE]]
-    cursors[CURSOR_CODED] = shape[0] * shape[1]
-    cursors[CURSOR_PROJECTED] = shape[0] * shape[1]
-    cursors[CURSOR_ENTRY] = 0
-
-
-@kernel
-def update(shape: tuple[int, int], operator: Operator, state: State) -> None:
+def update(operator: Operator, state: State) -> None:
     """Make the current plane that of the counts.
 
     Args:
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: all of it may be changed.
     """
-    mark_dirty(shape, operator, state)
-    for part in range(PARTS):
-        renew(part, shape, operator, state)
-    settle(operator, state)
-    for part in range(PARTS):
-        complete(part, shape, operator, state)
-    finish(shape, state)
+    mark_dirty(operator, state)
+    renew(FIRST, ALONE, operator, state)
+    settle(state)
+    fill_plane(operator, state)
 
 
 @kernel
-def read(shape: tuple[int, int], operator: Operator, state: State, features: NDArray[np.float32]) -> None:
+def read(operator: Operator, state: State, features: NDArray[np.float32]) -> None:
     """Make the current plane that of the counts, and read the features: both in one call from Python.
 
     Args:
-        shape: rows and columns of the grid of volumes.
         operator: the encoder.
         state: all of it may be changed.
         features: as for `read_features`.
     """
-    update(shape, operator, state)
+    update(operator, state)
     read_features(operator, state, features)

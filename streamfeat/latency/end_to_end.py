@@ -1,15 +1,15 @@
-"""End to end: from the moment events are due to the moment a sink holds what was read from them.
+"""End to end: from the time that events are due to the time that a sink holds the emission.
 
 Lives here: running the real pipeline at the pace of the recording, with a watch at both ends.
 Not here: the pipeline itself, which is not changed and not told; a single update (`update`).
 
 At recorded pace the pipeline hands on packets, cut to at most 10 ms of the clock, when their latest event
 is due by the clock. A latency is the time from there until an emission that reflects this packet is handed
-to the sink. In it: waiting in both queues, two changes of thread on either side, feeding, reading, and, under
-`event`, the 256 emissions that travel together. Not in it: what happens before a packet is complete (an event
-waits for the rest of its 10 ms), and what a sink does afterwards. When the machine cannot keep the pace,
-packets are handed on late, and since latency counts from when they were due, it grows: nothing is hidden
-by a source that waits. Silence between labelled samples is cut to one window.
+to the sink. It includes waiting in both queues, two changes of thread on either side, feeding, making the
+emission and, under `event`, the 256 emissions that travel together. It does not include the time before a
+packet is complete (an event waits for the rest of its 10 ms) and the work of a sink afterwards. When the
+machine cannot keep the pace, packets are handed on late, and latency, which counts from when they were due,
+grows: a source that waits hides nothing. Silence between labelled samples is cut to one window.
 """
 
 import asyncio
@@ -43,6 +43,7 @@ def measure_end_to_end(
     *,
     speed: float,
     look_ahead: bool,
+    threads: int = 1,
     warm_up: Iterable[Item] = (),
     goes: Callable[[], bool] = lambda: True,
 ) -> NDArray[np.int64]:
@@ -54,6 +55,7 @@ def measure_end_to_end(
         policy: when features are read.
         speed: stream seconds for each second of the clock.
         look_ahead: whether engines look ahead where the policy reads after every event.
+        threads: of the engines, see `Engine`.
         warm_up: items that run through the same parts beforehand, as fast as possible.
         goes: asked 20 times a second whether to go on.
 
@@ -64,7 +66,7 @@ def measure_end_to_end(
         InputError: a sensor has no place for a volume.
     """
     engine = partial(_engine, look_ahead)
-    warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
+    warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine, threads=threads)
     warmed: Pipeline[Item, Emission] = Pipeline(warm_up, warming, [_WatchedSink()])
     asyncio.run(warmed.run())
     started: list[tuple[int, int]] = []
@@ -73,7 +75,7 @@ def measure_end_to_end(
         if not started:
             started.append((monotonic_ns(), t_us))
 
-    session = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine)
+    session = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine, threads=threads)
     sink = _WatchedSink()
     pipeline: Pipeline[Item, Emission] = Pipeline(
         without_silence(items, encoder.geometry.window_us),

@@ -24,7 +24,7 @@ class Latencies:
     All figures come from one HDR histogram, so that decoding it gives the same ones.
 
     Args:
-        ns: `(n,)` int64; not changed. What is above 60 s counts as 60 s.
+        ns: `(n,)` int64; not changed. A value above 60 s counts as 60 s.
         weights: `(n,)` int64, how many events each stands for; one each if not given.
     """
 
@@ -100,7 +100,7 @@ class RecentLatencies:
         self._current, self._before = (HdrHistogram(1, _LONGEST_NS, _DIGITS) for _ in range(2))
 
     def add(self, ns: float) -> None:
-        """Count one, in nanoseconds; what is below 1 ns or above 60 s counts as that."""
+        """Count one, in nanoseconds; a value below 1 ns or above 60 s counts as that bound."""
         if self._current.get_total_count() >= _RECENT:
             self._before, self._current = self._current, HdrHistogram(1, _LONGEST_NS, _DIGITS)
         self._current.record_value(min(max(round(ns), 1), _LONGEST_NS))

@@ -14,6 +14,7 @@ import numpy as np
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.latency.end_to_end import measure_end_to_end
@@ -62,10 +63,10 @@ class Row:
     """One distribution.
 
     Attributes:
-        model: what was measured.
+        model: the model that was measured.
         emit: under which policy.
-        what: which part of it.
-        latencies: how long it took.
+        what: the part of the way.
+        latencies: their distribution.
         boundary_share: share of events that began a new bin, where that is known.
         walk: each event by itself, where each was timed by itself.
     """
@@ -93,6 +94,7 @@ class LatencyReport:
         seconds: clock seconds that each measurement takes at most.
         speed: of the end to end, a multiple of the recorded pace.
         look_ahead: prepare bin boundaries beforehand where every event is followed.
+        threads: that share a large emission, see `usable_threads`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -112,8 +114,9 @@ class LatencyReport:
         seconds: float = 2.0,
         speed: float = 1.0,
         look_ahead: bool = True,
+        threads: int | None = None,
     ) -> None:
-        """Open and check everything; nothing is measured yet."""
+        """Open and check everything, without measuring."""
         for name, value, most in (("--seconds", seconds, _MOST_SECONDS), ("--speed", speed, 1e9)):
             if not 0 < value < most:
                 raise InputError(
@@ -124,7 +127,7 @@ class LatencyReport:
                 raise InputError(f"{name} {count} is not possible; give at least {least}")
         self._policies = [(emit, EmitPolicy.parse(emit)) for emit in dict.fromkeys(emits)]
         self._recording, self._topic, self._split = recording, topic, split
-        self._reading = reading
+        self._reading, self._threads = reading, usable_threads(threads)
         self._warm_up, self._limit = warm_up, limit_events
         self._seconds, self._speed, self._look_ahead = seconds, speed, look_ahead
         names = [path.stem for path in models]
@@ -171,7 +174,7 @@ class LatencyReport:
         self.steal, self.preemptions = disturbance.steal_share(), disturbance.preemptions()
 
     def result(self) -> dict[str, Any]:
-        """What was measured, as JSON values."""
+        """The measurements as JSON values."""
         return {
             "recording": str(self._recording),
             "machine": describe_machine(),
@@ -184,6 +187,7 @@ class LatencyReport:
             "seconds": self._seconds,
             "speed": self._speed,
             "look_ahead": self._look_ahead,
+            "threads": self._threads,
             "interrupted": self.interrupted,
             "models": [model.describe() for model in self._models],
             "rows": [
@@ -222,7 +226,7 @@ class LatencyReport:
         if job.policy == EmitPolicy("events", 1):
             steps = [self._updates, self._calls, self._end_to_end]
         else:
-            steps = [self._readings, self._end_to_end]
+            steps = [self._emissions, self._end_to_end]
         for step in steps:
             if not job.stopped():
                 yield from step(job)
@@ -243,12 +247,12 @@ class LatencyReport:
         )
         yield job.row("from Python", Latencies(found.ns))
 
-    def _readings(self, job: "_Job") -> Iterator[Row]:
+    def _emissions(self, job: "_Job") -> Iterator[Row]:
         goes = self._budget(job, "feed and read")
         found = feed_and_read(job.model.encoder, self._items, job.policy, warm_up=self._warm_up, goes=goes)
         each_event = np.round(found.batch_ns / found.batch_events).astype(np.int64)
         yield job.row("ingest", Latencies(each_event, found.batch_events))
-        yield job.row("reading", Latencies(found.reading_ns))
+        yield job.row("emission", Latencies(found.emission_ns))
 
     def _end_to_end(self, job: "_Job") -> Iterator[Row]:
         ends: list[float] = []
@@ -268,6 +272,7 @@ class LatencyReport:
             job.policy,
             speed=self._speed,
             look_ahead=self._look_ahead,
+            threads=self._threads,
             warm_up=_first_events(self._items, self._warm_up),
             goes=goes,
         )

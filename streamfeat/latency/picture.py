@@ -33,7 +33,7 @@ _DASHES = {
     "bin boundary": "dotted",
     "from Python": "dashdot",
     "ingest": "dotted",
-    "reading": "solid",
+    "emission": "solid",
     "end to end": "dashed",
 }
 _MATPLOTLIB_DASHES = {"solid": "-", "dotted": ":", "dashed": "--", "dashdot": "-."}

@@ -47,7 +47,6 @@ def follow_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDA
     stamps, bins = np.empty((2, len(events) + 1), np.int64)
     _walk(
         events,
-        engine.grid_shape,
         engine._operator,
         engine._state,
         np.empty(2, np.int64),
@@ -85,7 +84,6 @@ def _tick(timespec: Stamps, stamps: Stamps) -> None:
 @njit(nogil=True)
 def _walk(
     events: Events,
-    shape: tuple[int, int],
     operator: Operator,
     state: State,
     timespec: Stamps,
@@ -95,6 +93,6 @@ def _walk(
     bins[0] = state.clock[CLOCK_NOW]
     stamps[0] = _now(timespec)
     for i in range(events.shape[0]):
-        follow(events[i : i + 1], shape, operator, state)
+        follow(events[i : i + 1], operator, state)
         bins[i + 1] = state.clock[CLOCK_NOW]
         stamps[i + 1] = _now(timespec)

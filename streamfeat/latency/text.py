@@ -54,9 +54,9 @@ def notes(report: LatencyReport) -> list[str]:
         f"{result['warm_up_events']:,} events of each measurement.",
         "update: from handing over an event until features are current, timed in a compiled loop; "
         "bin boundary: those events alone that begin a bin. from Python: follow() and features() called for "
-        "each event. ingest: feed(), its time shared out among the events of a batch; reading: features(). "
+        "each event. ingest: feed(), its time shared out among the events of a batch; emission: features(). "
         f"end to end: from when a packet is due, at {result['speed']:g} x the recorded pace, until a sink "
-        "holds what was read.",
+        "holds the emission.",
     ]
     how = "with" if result["look_ahead"] else "without"
     said += [

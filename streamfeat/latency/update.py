@@ -24,7 +24,7 @@ from streamfeat.recordings.reader import Label, Packet
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.session import Session
 
-__all__ = ["Readings", "Walk", "call_each", "feed_and_read", "walk"]
+__all__ = ["Emissions", "Walk", "call_each", "feed_and_read", "walk"]
 
 _CHUNK = 256
 """Events between two questions whether to go on."""
@@ -54,18 +54,18 @@ class Walk:
 
 
 @dataclass(slots=True)
-class Readings:
-    """A stream fed and read as a policy says.
+class Emissions:
+    """A stream fed, and its features emitted as a policy says.
 
     Attributes:
         batch_events: `(m,)` int64, events of each batch fed.
         batch_ns: `(m,)` int64, nanoseconds of feeding it.
-        reading_ns: `(r,)` int64, nanoseconds of each reading, moving stream time on included.
+        emission_ns: `(r,)` int64, nanoseconds of each emission, moving stream time on included.
     """
 
     batch_events: NDArray[np.int64]
     batch_ns: NDArray[np.int64]
-    reading_ns: NDArray[np.int64]
+    emission_ns: NDArray[np.int64]
 
 
 def walk(
@@ -103,14 +103,14 @@ def feed_and_read(
     *,
     warm_up: int,
     goes: Goes = lambda done: True,
-) -> Readings:
+) -> Emissions:
     """Let a session feed and read an engine as the policy says, as fast as it can.
 
     Args:
         encoder: the frozen encoder.
         items: packets and labels in stream order.
         policy: when to read; not after every event, which is `walk`.
-        warm_up: events at the start that are fed but not counted; a batch or a reading counts that reaches
+        warm_up: events at the start that are fed but not counted; a batch or an emission counts that reaches
             beyond them.
         goes: asked after each item.
     """
@@ -124,9 +124,9 @@ def feed_and_read(
         if not goes(done):
             break
     batches = np.array(log.batches, np.int64).reshape(-1, 3)
-    readings = np.array(log.readings, np.int64).reshape(-1, 2)
-    batches, readings = batches[batches[:, 0] > warm_up], readings[readings[:, 0] > warm_up]
-    return Readings(batches[:, 1], batches[:, 2], readings[:, 1])
+    emissions = np.array(log.emissions, np.int64).reshape(-1, 2)
+    batches, emissions = batches[batches[:, 0] > warm_up], emissions[emissions[:, 0] > warm_up]
+    return Emissions(batches[:, 1], batches[:, 2], emissions[:, 1])
 
 
 def _each_event(
@@ -192,11 +192,11 @@ def _call_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDAr
 
 @dataclass(slots=True)
 class _Log:
-    """What engines of one session were asked to do, each with the number of events until then."""
+    """Calls of the engines of one session, each with the number of events until then."""
 
     events: int = 0
     batches: list[tuple[int, int, int]] = field(default_factory=list)
-    readings: list[tuple[int, int]] = field(default_factory=list)
+    emissions: list[tuple[int, int]] = field(default_factory=list)
 
 
 class _LoggedEngine(Engine):
@@ -224,5 +224,5 @@ class _LoggedEngine(Engine):
         begun = monotonic_ns()
         features = super().features()
         took = monotonic_ns() - begun + self._moved_ns
-        self._log.readings.append((self._log.events, took))
+        self._log.emissions.append((self._log.events, took))
         return features

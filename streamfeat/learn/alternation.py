@@ -24,7 +24,7 @@ __all__ = ["Alternation", "Step"]
 
 
 class Step(NamedTuple):
-    """What one iteration found: the rows learned, and the objective after each of its half-steps."""
+    """Result of one iteration: the rows learned, and the objective after each of its half-steps."""
 
     rows: NDArray[np.float32]
     after_codes: float
@@ -35,8 +35,8 @@ class Step(NamedTuple):
 class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Alternating minimisation over codes and the `(K, d)` rows of a transform or dictionary.
 
-    The rows are float32 from one iteration to the next, so that going on from saved ones is going on from
-    what there was.
+    The rows are float32 from one iteration to the next, so that learning goes on from saved rows with the
+    same bits.
 
     Args:
         max_iter: iterations at most, each of two half-steps.
@@ -108,7 +108,7 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         condition: list[float],
         coherence: list[float],
     ) -> None:
-        """What was found so far is what was found, whatever comes next; nothing else changes it."""
+        """Keep the rows so far as the result; only the next whole iteration replaces it."""
         self.components_ = rows
         self.objective_ = np.array(objective)
         self.condition_ = np.array(condition)

@@ -23,7 +23,7 @@ Make = Callable[[Any], NDArray[np.float32]]
 
 
 class Rows(Protocol):
-    """What has a shape and gives rows for a slice or for indices: arrays, memory maps."""
+    """A matrix with a shape that gives rows for a slice or for indices: an array, a memory map."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -98,7 +98,7 @@ class ChunkedVolumes:
         return self._workers.each(self._on(beside), self._tuples(beside), *self._shared(step, common))
 
     def fetch(self, held: list[Any], read: Callable[[Any], Any] | None = None) -> list[Any]:
-        """What `each` holds, or `read` of it."""
+        """The values of `each`, passed through `read` if that is given."""
         return self._workers.fetch(self._workers.each(read, [(one,) for one in held]) if read else held)
 
     def _tuples(self, beside: list[Any] | None) -> list[tuple[Any, ...]]:

@@ -36,7 +36,7 @@ _WHOLE = 0.95
 """Share of the labelled samples that a window shall hold whole."""
 
 Report = Callable[[str, int, int, str], None]
-"""Called with (step, done, of how many, remark); of how many is 0 where nobody knows."""
+"""Called with (step, done, of how many, remark); of how many is 0 where that is unknown."""
 
 Keep = Callable[[Callable[[], Encoder]], None]
 """Called after each iteration with a function that makes the encoder so far."""
@@ -70,7 +70,7 @@ def geometry_of(
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """What filters are learned from, and all of an encoder but its filters."""
+    """The volumes that filters are learned from, and all of an encoder but its filters."""
 
     setting: Setting
     geometry: Geometry
@@ -105,9 +105,9 @@ def prepare(
 ) -> Material:
     """Sample volumes and learn their whitening; samples of held-out splits are not looked at.
 
-    Recordings are read once, in parts, for a sample of volumes, which is kept as small integers:
-    `volumes * d` bytes. No float copy of it is made. Without `window_ms` and `geometry` labels have to be
-    known first: that is one pass more.
+    Events are read and decoded once, in parts, for a sample of volumes, which is kept as small integers:
+    `volumes * d` bytes. No float copy of it is made. Without `window_ms` and `geometry`, labels are read
+    first, without decoding events.
 
     Args:
         recordings: open recordings.
@@ -136,7 +136,7 @@ def _sample(
     report: Report,
     workers: Workers,
 ) -> Volumes:
-    """A sample of all recordings; what is not of the smallest keys so far is not even sent."""
+    """A sample of all recordings; workers send only volumes whose keys are among the smallest so far."""
     n = setting.volumes
     volumes, waiting = Volumes.none(geometry), list[Volumes]()
     parts = [*_openers(recordings)]
@@ -164,7 +164,7 @@ def _sample(
 
 
 def _openers(recordings: Sequence[Recording]) -> Iterator[tuple[Callable[[], Recording], int]]:
-    """What opens each part, and the number of the recording that it is of."""
+    """A function that opens each part, and the number of its recording."""
     for number, recording in enumerate(recordings):
         for part in recording.parts():
             yield recording.part(part), number
@@ -172,13 +172,13 @@ def _openers(recordings: Sequence[Recording]) -> Iterator[tuple[Callable[[], Rec
 
 def _labels(opener: Callable[[], Recording], number: int) -> list[Label]:
     with opener() as recording:
-        return recording.labels
+        return [*recording.stored_labels()]
 
 
 def _sample_part(
     opener: Callable[[], Recording], number: int, limit: int, geometry: Geometry, n: int, seed: int
 ) -> tuple[int, Volumes, Losses]:
-    """The number of the recording, volumes of one part of it, what could not be read."""
+    """The number of the recording, the volumes of one part of it, and its losses."""
     with opener() as recording:
         windows = windows_of(recording.items(), geometry)
         volumes = sample_volumes(windows, geometry, n, (seed, number), limit=limit)
@@ -196,15 +196,15 @@ def learn_encoder(
 ) -> Encoder:
     """Learn an encoder without labels; samples of held-out splits are not looked at.
 
-    Ctrl-C while learning ends it: the encoder is that of the last whole iteration, and says so
+    Ctrl-C while learning ends it: the encoder is that of the last whole iteration, and is marked
     (`provenance["interrupted"]`).
 
     Args:
-        recordings: open recordings; read as often as `prepare` says.
+        recordings: open recordings; their events are decoded once.
         setting: geometry and learning; iterations are those beyond `resume`.
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.
-        keep: may keep what was learned so far, which says of itself that it was interrupted.
+        keep: may save the encoder so far, which is marked as interrupted.
         workers: read and compute; what is learned is the same wherever that is.
 
     Raises:
@@ -314,6 +314,6 @@ def _check_resumable(
 
 
 def _origin(encoder: Encoder) -> str:
-    """What a model says of where it comes from."""
+    """The provenance of a model in a few words."""
     known = encoder.provenance
     return f"{known.get('volumes')} of {', '.join(known.get('recordings', []))}, seed {known.get('seed')}"

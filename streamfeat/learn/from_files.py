@@ -1,7 +1,7 @@
 """Learning with one call, for programs.
 
 Lives here: `learn_encoder` as `import streamfeat` offers it, which opens recordings and sums up settings.
-Not here: the steps of learning (`fit`), what can be set (`settings`).
+Not here: the steps of learning (`fit`), the settings (`settings`).
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,7 @@
-"""What both formulations ask of a matrix beside the fit: `Omega`, and the two figures that show it.
+"""The penalty of both formulations on a matrix, `Omega`, and the two figures that show it.
 
-Lives here: the penalty with its gradient, condition number, mutual coherence. Not here: who minimises it.
+Lives here: the penalty with its gradient, condition number, mutual coherence.
+Not here: the learners that minimise it.
 """
 
 from dataclasses import dataclass

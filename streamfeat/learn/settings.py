@@ -1,6 +1,6 @@
-"""What learning can be told, in one place.
+"""The settings of learning, in one place.
 
-Lives here: `Setting`, its checks, its presets. Not here: what is done with it (`fit`).
+Lives here: `Setting`, its checks, its presets. Not here: learning itself (`fit`).
 Imports nothing that is slow to import, so that a command line can show its defaults.
 """
 
@@ -32,7 +32,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "iterations": 20,
     },
 }
-"""What each preset has other than the defaults of `Setting`."""
+"""Values in which each preset differs from the defaults of `Setting`."""
 
 LAMBDAS = {("direct", "unit"): 2.0, ("direct", "free"): 0.5, ("inverse", "unit"): 1.0}
 """Default sparsity penalty in learning, of each formulation and kind of rows."""
@@ -43,7 +43,7 @@ THRESHOLD = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """What `streamfeat learn` can be told of geometry and learning, with its defaults.
+    """The settings of `streamfeat learn`: geometry and learning, with their defaults.
 
     Names that `Geometry` has as well are handed on to it.
 

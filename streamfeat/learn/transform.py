@@ -26,7 +26,7 @@ L-BFGS come; each costs two to three products of `(K, d)` with `(d, d)`, little 
 
 
 class _Quadratic(NamedTuple):
-    """What is minimised over `A` for fixed codes: `1/2 tr(A S A') - tr(A C') + Omega(A)`."""
+    """The objective over `A` for fixed codes: `1/2 tr(A S A') - tr(A C') + Omega(A)`."""
 
     moment: NDArray[np.float64]  # S + conditioning I, S = X X' / n, (d, d)
     cross: NDArray[np.float64]  # C = L X' / n, (K, d)

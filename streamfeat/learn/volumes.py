@@ -171,8 +171,8 @@ def sample_volumes(
 def _draw_from(
     window: Window, geometry: Geometry, seed: Sequence[int], limit: int, per_window: int
 ) -> Volumes:
-    moment = window.origin_us % (1 << 64)  # a generator's seed is not negative
-    rng = np.random.default_rng([*seed, moment, len(window.events)])
+    origin = window.origin_us % (1 << 64)  # a generator's seed is not negative
+    rng = np.random.default_rng([*seed, origin, len(window.events)])
     counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
     places = sliding_window_view(counts, (geometry.patch, geometry.patch), axis=(1, 2))
     keys = rng.integers(0, KEYS, per_window)

@@ -22,7 +22,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from streamfeat.engine.engine import Snapshot
+from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import sweep
 from streamfeat.files.json_fields import Fields

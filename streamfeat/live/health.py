@@ -37,18 +37,12 @@ class CameraFigures:
     Attributes:
         topic: of the camera.
         events: accepted.
-        emissions: emissions made.
-        lost: packets that never arrived or were dropped.
-        t_us: stream time of the latest emission; None before the first.
-        prediction: of that emission; None without a classifier.
+        latest: the latest emission; None before the first.
     """
 
     topic: str
     events: int
-    emissions: int
-    lost: int
-    t_us: int | None
-    prediction: str | None
+    latest: Emission | None
 
 
 class Health:
@@ -187,14 +181,10 @@ class Health:
 
     def cameras(self) -> list[CameraFigures]:
         """Each camera that is served, in order of appearance."""
-        found = []
-        for topic, stats in self._cameras.stats_by_topic().items():
-            state, latest = self._intake.topics.get(topic), self._latest.get(topic)
-            delivery = state.delivery.stats if state else DeliveryStats()
-            lost, t_us = delivery.lost + delivery.dropped, latest.t_us if latest else None
-            prediction = latest.prediction if latest else None
-            found.append(CameraFigures(topic, stats.events, stats.emissions, lost, t_us, prediction))
-        return found
+        return [
+            CameraFigures(topic, stats.events, self._latest.get(topic))
+            for topic, stats in self._cameras.stats_by_topic().items()
+        ]
 
     def collect(self) -> Iterable[Metric]:
         """Everything that is counted elsewhere, for Prometheus."""

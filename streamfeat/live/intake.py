@@ -139,7 +139,7 @@ class Intake:
             passed_ns: since then.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         now_ns = time.monotonic_ns()
         state = TopicState(PacketReader(topic, MAX_LIVE_PACKET_EVENTS), CameraClock(self._window_us))

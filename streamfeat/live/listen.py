@@ -18,6 +18,7 @@ from rich.live import Live
 
 from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
@@ -79,6 +80,7 @@ class ListenJob:
         console: for warnings.
         engine_of: what makes the engines of a camera, given its topic; see `Session`.
         tap: what items pass through before anything is computed from them.
+        threads: that share a large emission, for each camera; see `usable_threads`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -107,6 +109,7 @@ class ListenJob:
         console: Console | None = None,
         engine_of: Callable[[str], Callable[..., Engine]] = lambda topic: Engine,
         tap: Callable[[Iterable[Any]], Iterable[Any]] = lambda items: items,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything but the network, before anything is written."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
@@ -125,7 +128,7 @@ class ListenJob:
         self._address = parse_address(metrics) if metrics else None
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._network, self._publish = learn_online, network, publish
-        self._engine_of, self._tap = engine_of, tap
+        self._engine_of, self._tap, self._threads = engine_of, tap, usable_threads(threads)
         self._patience_ns = patience_s * 1e9
         self.interrupted = False
         self._warnings = Warnings.on(console)
@@ -201,7 +204,10 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                return lines.open(self._encoder.n_features, labels, recording_sink=_recording_sink)
+                n_filters = self._encoder.n_filters
+                return lines.open(
+                    self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
+                )
 
             with self.opened(sinks) as pipeline:
                 self.interrupted = run_until_interrupted([pipeline], self.stop)
@@ -234,6 +240,7 @@ class ListenJob:
             engine=self._engine_of(topic),
             denoising=self._denoising,
             load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
+            threads=self._threads,
         )
 
     def _checkpointer(self, path: Path) -> Checkpointer:
@@ -280,6 +287,7 @@ def listen(
     zenoh_config: str | PathLike[str] | None = None,
     reliable: bool = False,
     publish: bool = False,
+    threads: int | None = None,
 ) -> EmissionStream:
     """Listen to live topics as an asynchronous iterator of emissions, those that `streamfeat listen` makes.
 
@@ -306,16 +314,18 @@ def listen(
         zenoh_config: JSON5 configuration of zenoh; without it, this machine alone.
         reliable: recover missed packets, from publishers that do the same.
         publish: publish features and predictions beside the events, too.
+        threads: that share a large emission, for each camera; all cores but one if not given.
 
     Returns:
         the stream; nothing is opened before it is used. Iterating raises InputError where a file or the
         network cannot be used.
 
     Raises:
-        InputError: a topic, `emit` or `port` makes no sense.
+        InputError: a topic, `emit`, `port` or `threads` makes no sense.
     """
     names: Names = RosNames(topics, ros_domain) if topics.startswith("/") else PlainNames(topics)
     policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
+    usable_threads(threads)  # now, not when it is used
     network = Network(Path(zenoh_config) if zenoh_config else None, port, reliable)
 
     def make_job() -> ListenJob:
@@ -328,6 +338,7 @@ def listen(
             max_delay_s=max_delay_s,
             network=network,
             publish=publish,
+            threads=threads,
         )
 
     return EmissionStream(make_job)

@@ -113,7 +113,7 @@ class PublishJob:
         """What happened, as JSON values."""
         events = sum(cutter.events for cutter in self._cutters)
         return {
-            "topics": ", ".join(topic for _, topic in self._sources),
+            "topics": [topic for _, topic in self._sources],
             "packets": sum(sink.events.seq for sink in self._sinks),
             "events": events,
             "bytes": sum(sink.n_bytes for sink in self._sinks),

@@ -121,7 +121,7 @@ class RecordJob:
         delivery = sum((topic.stats for topic in self._topics.values()), DeliveryStats())
         return {
             "written": str(self._target),
-            "topics": ", ".join(sorted(self._written)),
+            "topics": sorted(self._written),
             "messages": self._written.total(),
             "bytes": self._bytes,
             "seconds": round(self._seconds, 3),

@@ -79,7 +79,7 @@ class TopicState:
         """Go on from a snapshot that was taken at `now_ns`, by the monotonic clock as it is now.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         self.reader.restore(values.inner("reader"))
         self.clock.restore(values.inner("clock"), now_ns)

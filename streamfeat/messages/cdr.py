@@ -41,6 +41,9 @@ def _schema(fields: str, *more: str) -> str:
     return "std_msgs/Header header\n" + fields + "".join(more) + _HEADER_TEXT + _TIME_TEXT
 
 
+_NUMBERS = {code: struct.Struct(f"<{code}") for code in "BiIqQ"}
+
+
 class _Reader:
     """Takes one CDR message apart, front to back; every length is checked before it is used."""
 
@@ -58,10 +61,13 @@ class _Reader:
 
     def number(self, code: str, field: str) -> int:
         """Read one integer or boolean of `struct` type `code`."""
-        size = struct.calcsize(code)
-        self._at += -(self._at - 4) % size
-        (value,) = struct.unpack(f"<{code}", self._take(size, field))
-        return int(value)
+        layout = _NUMBERS[code]
+        at = self._at - (self._at - 4) % -layout.size
+        if at + layout.size > len(self._data):
+            self._at = at
+            self._take(layout.size, field)  # says what is missing
+        self._at = at + layout.size
+        return int(layout.unpack_from(self._data, at)[0])
 
     def string(self, field: str) -> str:
         """Read a string; the zero byte that ends it is dropped."""

@@ -77,7 +77,7 @@ class CameraClock:
         """Go on from a snapshot.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         self._last_us = values.maybe("last_us", 0, _LATEST_US)
         self._heard_ns = now_ns - values.whole("passed_ns")

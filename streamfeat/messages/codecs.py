@@ -290,7 +290,10 @@ def _room_for(words: _Words, single: int, vectors: dict[int, int], encoding: str
     kind = words >> 12
     n = int(np.count_nonzero(kind == single))
     for code, width in vectors.items():
-        n += int(np.bitwise_count(words[kind == code] & ((1 << width) - 1)).sum(dtype=np.int64))
+        is_vector = kind == code
+        if is_vector.any():
+            bits = words[is_vector] & ((1 << width) - 1)
+            n += int(np.bitwise_count(bits).sum(dtype=np.int64))
     _check_count(n, limit, encoding)
     return np.zeros(n, EVENT_DTYPE)
 

@@ -179,7 +179,7 @@ class Delivery:
         """Go on from a snapshot; whether publishers are there is for them to say.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         stats = values.inner("stats")
         # Packets that come late after all are taken from those that were lost.

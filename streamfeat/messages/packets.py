@@ -159,7 +159,7 @@ class PacketReader:
         """Go on from a snapshot.
 
         Raises:
-            InputError: it is none.
+            InputError: the values are not a snapshot.
         """
         self._last_seq = values.maybe("last_seq", 0, 1 << 64)
         self._is_broken = values.flag("is_broken")

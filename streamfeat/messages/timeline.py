@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from streamfeat.errors import InputError
+from streamfeat.events import Events
 from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.clock import CameraClock
@@ -152,10 +153,17 @@ class Timeline:
         if is_behind and -BACK_US <= int(t[0]) - EVT3_WRAP_US - before_us <= STEP_US:
             at: int | None = 0
         else:
-            at = None if held else false_wrap(t, before_us, len(t) // 8)
+            is_plain = bool(held) or self._is_short(packet.events, before_us)
+            at = None if is_plain else false_wrap(t, before_us, len(t) // 8)
         if at is not None:
             t[at:] -= EVT3_WRAP_US
             self._reader.count_wraps(-1)
+
+    def _is_short(self, events: Events, before_us: int) -> bool:
+        """Whether no two times of a packet of evt3, or before it, are half the range of its clock apart."""
+        time_span(events, 1 << 16, 1 << 16, self._span)
+        first, last = self._span.tolist()
+        return bool(last - min(first, before_us) <= EVT3_WRAP_US // 2)
 
     def packet(self, packet: Packet) -> Iterator[Packet | Label]:
         """Take in a packet that is decoded, and yield what is certain now."""

@@ -1,4 +1,4 @@
-"""Several files as one recording: rosbag2 folders, and files that somebody lists.
+"""Several files as one recording: rosbag2 folders, and lists of files.
 
 Lives here: which files of a folder belong to the bag, what its `metadata.yaml` promises, and reading all of
 them in the order of log time, each opened when its time comes.
@@ -33,7 +33,7 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What a `metadata.yaml` says of its bag.
+    """The contents of a bag according to its `metadata.yaml`.
 
     Attributes:
         names: of files, without folders.
@@ -67,7 +67,7 @@ def is_bag(folder: Location) -> bool:
 
 
 def bag_members(folder: Location) -> tuple[list[Location], Metadata, list[str]]:
-    """The files of a bag in a folder, what is promised of them, and what is to be said about that.
+    """The files of a bag in a folder, its metadata, and a line for each assumption that was made.
 
     The files are those that `metadata.yaml` names, as far as they are there; all that a bag can have if none
     of them is there. A file beside its own compressed copy stands for both.
@@ -198,7 +198,7 @@ class FilesSource:
 
 
 def assumptions_of(source: Source) -> list[str]:
-    """What a source had to assume, if it is of a kind that has to."""
+    """Assumptions that a source had to make; only some kinds do."""
     return list(getattr(source, "assumptions", ()))
 
 

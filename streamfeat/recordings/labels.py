@@ -1,21 +1,22 @@
 """Labels for a recording that has none: from a table, put between its packets.
 
-Lives here: reading a label file, and where its labels stand in a stream.
+Lives here: reading and writing a label file, and where its labels stand in a stream.
 Not here: labels that are in the recording (`reader`), and samples made of them (`samples`).
 
 A label file is a table with commas and a line of names: `start`, `end` (or `duration`) and `label`, and if
 wanted `split` and `source`. What the names of the times end in is their unit: `start_s` counts seconds after
 the first event, `start_ms` milliseconds after it, `start_us` is stream time in microseconds, as emissions
 and `info` print it. Without such an ending the values decide: whole numbers of which one reaches 100,000 are
-stream time, all others are seconds after the first event; which of the two is said.
+stream time, all others are seconds after the first event; which of the two is said. Lines that begin with #
+are remarks; those before the names may say something by name, as `# recording: drive.mcap`.
 """
 
 import csv
 import io
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, takewhile
 from math import isfinite
 from pathlib import Path
 from typing import Literal
@@ -25,7 +26,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.messages.packets import Label, Packet
 
-__all__ = ["LabelTable", "read_labels", "with_labels"]
+__all__ = ["LabelTable", "label_text", "read_labels", "with_labels"]
 
 _MOST_BYTES = 64 << 20
 _LATEST_US = 1 << 52
@@ -52,19 +53,22 @@ class LabelTable:
         clock: what times count: `stream` time; since the `first` event; or since 1970 by the `host`'s clock,
             which log times are of.
         assumption: what the file does not say; empty if it says all.
+        remarks: what lines that begin with # say by name.
     """
 
     path: Path
     labels: tuple[Label, ...]
     clock: Literal["stream", "first", "host"]
     assumption: str = ""
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_labels(path: Path) -> LabelTable:
     """Read a label file.
 
     Raises:
-        InputError: it is missing, or no such table; a time is none, or two labels overlap. Names the line.
+        InputError: the file is missing or not such a table, a time is not a number, or two labels overlap.
+            Names the line.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -110,18 +114,38 @@ def read_labels(path: Path) -> LabelTable:
                 f"{path}: lines {n} and {m} overlap: {first.label!r} ends after {second.label!r} begins; "
                 "a moment has one label"
             )
-    return LabelTable(
-        path, tuple(label for label, _ in labels), "stream" if unit == "us" else "first", assumption
-    )
+    clock: Literal["stream", "first"] = "stream" if unit == "us" else "first"
+    return LabelTable(path, tuple(label for label, _ in labels), clock, assumption, _remarks(text))
+
+
+def label_text(labels: Sequence[Label], remarks: Mapping[str, str]) -> str:
+    """A label file in stream time, as `read_labels` reads it.
+
+    Args:
+        labels: in order of time.
+        remarks: what its first lines say, text of one line by name.
+    """
+    more = [name for name in ("split", "source") if any(getattr(label, name) for label in labels)]
+    file = io.StringIO()
+    file.writelines(f"# {name}: {text}\n" for name, text in remarks.items())
+    table = csv.writer(file, lineterminator="\n")
+    table.writerow(["start_us", "end_us", "label", *more])
+    for label in labels:
+        end_us = label.start_us + label.duration_us
+        table.writerow([label.start_us, end_us, label.label, *(getattr(label, name) for name in more)])
+    return file.getvalue()
+
+
+def _remarks(text: str) -> dict[str, str]:
+    lines = (line[1:].partition(":") for line in takewhile(lambda line: line[:1] == "#", text.splitlines()))
+    return {name.strip(): said.strip() for name, _, said in lines}
 
 
 def _rows(path: Path, text: str) -> Iterator[list[str]]:
+    names = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
+    delimiter = max(",;\t", key=names.count)
     try:
-        dialect = csv.Sniffer().sniff(text[:4096], delimiters=",;\t")
-    except csv.Error:
-        dialect = csv.excel
-    try:
-        yield from csv.reader(io.StringIO(text), dialect)
+        yield from csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)
     except csv.Error as error:
         raise InputError(f"{path}: is no table of labels: {error}") from None
 

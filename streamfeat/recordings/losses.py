@@ -1,4 +1,4 @@
-"""What a pass over a recording could not read.
+"""Losses of a pass over a recording.
 
 Lives here: `Losses`. Not here: finding damage (`records`), and what was read but not used (`timeline`).
 """
@@ -13,7 +13,7 @@ __all__ = ["Losses"]
 
 @dataclass(slots=True)
 class Losses:
-    """What one pass over a recording could not read, by named reason."""
+    """Losses of one pass over a recording, by named reason."""
 
     counts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)

@@ -14,7 +14,7 @@ __all__ = ["AS_IT_IS", "ReadOptions"]
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """What a recording does not say, or what is wanted beyond it. It is small and can be pickled.
+    """How to read a recording: facts that it lacks, and denoising. It is small and can be pickled.
 
     Attributes:
         columns: order of the columns of a table, such as `t,x,y,p`.
@@ -32,4 +32,4 @@ class ReadOptions:
 
 
 AS_IT_IS = ReadOptions()
-"""What the files say, and no more."""
+"""A recording as its files describe it."""

@@ -21,7 +21,7 @@ __all__ = ["BUFFER_BYTES", "are_in_order", "clean_cuts", "in_log_order"]
 
 BUFFER_BYTES = 64 << 20
 _OVERHEAD = 512
-"""What a message costs besides its data."""
+"""Bytes that a message takes besides its data."""
 
 _Waiting = tuple[int, int, int, StoredMessage]
 """Log time, number of arrival, byte, message: sorts by the first two."""

@@ -35,6 +35,7 @@ from streamfeat.recordings.sources import (
     SourceItem,
     StoredMessage,
     Topic,
+    labels_in,
     unpacked_message,
 )
 from streamfeat.recordings.totals import Totals
@@ -170,7 +171,7 @@ class Recording(Shown):
         return [Part(*ends) for ends in zip(cuts, [*cuts[1:], math.inf], strict=True)]
 
     def part(self, part: Part) -> Callable[[], "Recording"]:
-        """What opens some of this recording, wherever that is called, and can be pickled."""
+        """A function that opens a part of this recording; it can be pickled and called on any machine."""
         return partial(Recording, _wherever(self._given), self.topic, part, self._options)
 
     def items(self) -> Iterator[Packet | Label]:
@@ -248,7 +249,7 @@ class Recording(Shown):
 
     @property
     def counts(self) -> Counter[str]:
-        """What happened to packets and their times in the latest pass, see `Timeline.counts`."""
+        """Counts of packets and of their times in the latest pass, see `Timeline.counts`."""
         return self._timeline.counts
 
     def played(
@@ -310,6 +311,13 @@ class Recording(Shown):
         """All labels in stored order; the first use reads the whole file, as for the counts below."""
         return self._totals.labels
 
+    def stored_labels(self) -> Iterator[Label]:
+        """Yield the labels of this part, without its events; those that cannot be read are left out."""
+        if self._labels is not None:
+            yield from self.labels  # they are put into the stream by its times
+        elif self.is_labelled:
+            yield from labels_in(self._source, self.topic, self._part)
+
     @property
     def n_on(self) -> int:
         """Number of ON events."""
@@ -366,7 +374,7 @@ def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
-    """The same files, whatever folder somebody works in."""
+    """The same files, whatever the working directory."""
     if isinstance(path, str) or not isinstance(path, Sequence):
         return absolute(location_of(path))
     return [absolute(location_of(one)) for one in path]

@@ -75,7 +75,7 @@ class Block(NamedTuple):
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of an intact file says about it."""
+    """The summary at the end of an intact file."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -157,7 +157,7 @@ def iter_records(
         file: opened by `open_mcap`.
         losses: changed.
         start: the byte of a chunk to begin with; 0 for the first record.
-        end: from this byte on losses are not counted, for somebody else does.
+        end: from this byte on losses are not counted; the reader of the next part counts them.
         stop: end at this byte.
     """
     size = file.seek(0, os.SEEK_END)
@@ -362,7 +362,7 @@ def _swallows_a_chunk(file: BinaryIO, at: int, end: int, size: int) -> bool:
 
 
 def _is_record(opcode: int, length: int, head: bytes) -> bool:
-    """Whether a record may start with these bytes; types above 0x80 are private to whoever wrote them."""
+    """Whether a record may start with these bytes; types above 0x80 are private to their writer."""
     if opcode == Opcode.CHUNK:
         return _chunk_length(head, 0) == length
     is_index = _is_index(length, head)

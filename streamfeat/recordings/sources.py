@@ -1,4 +1,4 @@
-"""What a recording is read from, whatever its format: the protocol that files, bags and tables follow.
+"""Sources of recordings, of any format: the protocol that files, bags and tables follow.
 
 Lives here: `Source`, `Topic`, `Part`, and `StoredMessage`, which a source of messages gives.
 Not here: any one format (`mcap_source`), which of them a path has (`opening`), decoding and time (`reader`).
@@ -6,6 +6,7 @@ Not here: any one format (`mcap_source`), which of them a path has (`opening`), 
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
@@ -17,7 +18,7 @@ from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import EVENT_SCHEMAS, Label, Packet
 from streamfeat.recordings.records import MAX_RECORD_BYTES, Losses
 
-__all__ = ["WHOLE", "Part", "Source", "SourceItem", "StoredMessage", "Topic", "unpacked_message"]
+__all__ = ["WHOLE", "Part", "Source", "SourceItem", "StoredMessage", "Topic", "labels_in", "unpacked_message"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ class StoredMessage(NamedTuple):
 
 
 SourceItem = StoredMessage | Packet | Label
-"""What a source gives: messages that are still to be decoded, or packets and labels that are decoded."""
+"""An item of a source: a message still to be decoded, or a packet or label that is decoded."""
 
 
 class Source(Protocol):
@@ -135,3 +136,19 @@ def unpacked_message(data: bytes | memoryview) -> bytes | memoryview:
     if len(unpacked) > MAX_RECORD_BYTES:
         raise InputError(f"the compressed message has more than {MAX_RECORD_BYTES} bytes")
     return bytes(unpacked)
+
+
+def labels_in(source: Source, topic: str, part: Part) -> Iterator[Label]:
+    """Yield the labels of a part without decoding its events; those that cannot be read are left out.
+
+    Args:
+        source: of messages; nothing of it is changed.
+        topic: of the events.
+        part: which labels; those behind its end are not read.
+    """
+    for at, stored in source.read(topic, part, Losses()):
+        if at >= part.end:
+            return
+        if isinstance(stored, StoredMessage) and stored.schema == LabelMessage.SCHEMA_NAME:
+            with suppress(InputError):
+                yield Label.from_cdr(unpacked_message(stored.data))

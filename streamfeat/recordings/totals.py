@@ -1,4 +1,4 @@
-"""What only a full pass over a recording can tell.
+"""Totals that take a full pass over a recording.
 
 Lives here: `Totals`: labels, counts, the span of time, and the digest by which two people compare events.
 Not here: the pass itself (`reader`).
@@ -18,7 +18,7 @@ _DIGESTED = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "u1"), ("t", "<i8")])
 
 @dataclass(slots=True)
 class Totals:
-    """What only a full pass can tell."""
+    """Totals of a full pass."""
 
     labels: list[Label] = field(default_factory=list)
     n_on: int = 0

@@ -35,7 +35,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 class Disturbance:
-    """What others have done to this process since it was made."""
+    """Disturbance of this process by others since it was made."""
 
     def __init__(self) -> None:
         """Start now."""
@@ -58,7 +58,7 @@ class Disturbance:
 class PeakMemory:
     """The most memory this process held while the block ran, in `peak_mb` afterwards.
 
-    Where the system cannot forget an earlier peak (it is Linux that can), it is that of the whole process.
+    Only Linux can forget an earlier peak; elsewhere it is that of the whole process.
     """
 
     peak_mb: int

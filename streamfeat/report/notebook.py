@@ -1,4 +1,4 @@
-"""What encoders, engines, recordings and classifiers say of themselves.
+"""How encoders, engines, recordings and classifiers are shown in a notebook.
 
 Lives here: one line, and HTML with a small picture, of each kind; PNG without any library.
 Not here: reports with plots (`pages`).

@@ -1,4 +1,4 @@
-"""Reports: one page that can be sent to somebody, opened without a network, and printed.
+"""Reports: one page that can be sent by mail, opened without a network, and printed.
 
 Lives here: the skeleton of such a page, with paragraphs, tables and interactive figures.
 Not here: what a report says, or what its figures show.
@@ -43,11 +43,11 @@ def require(library: str, *, extra: str = "plot", what: str = "a picture") -> No
 
     Args:
         library: as it is imported.
-        extra: which has it.
-        what: needs it.
+        extra: of this package, which brings it.
+        what: the option or result that needs it, for the message.
 
     Raises:
-        InputError: it is not.
+        InputError: it is not installed.
     """
     from importlib.util import find_spec
 
@@ -72,7 +72,7 @@ def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
 
     figures = [part for section in sections for part in section.parts if not isinstance(part, str | Table)]
     for each in figures:
-        # As wide as the page, which may be a narrow one; buttons are for who points at it, not for print.
+        # As wide as the page, which may be a narrow one; buttons appear under the pointer, not in print.
         each.sizing_mode = "stretch_width"
         each.toolbar.logo, each.toolbar.autohide = None, True
     script, frames = components(figures) if figures else ("", ())

@@ -13,7 +13,7 @@ class Shown:
     __slots__ = ()
 
     def __repr__(self) -> str:
-        """One line: what it is, and its size."""
+        """One line: the kind of object and its size."""
         from streamfeat.report.notebook import line_of
 
         return line_of(self)

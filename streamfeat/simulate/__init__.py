@@ -1,4 +1,4 @@
-"""Simulated events: what an event camera would see of moving images.
+"""Simulated events of an event camera that sees moving images.
 
 Lives here: the camera model, saccades, and moving digits.
 Not here: files.

@@ -35,6 +35,7 @@ class Emission:
         final: this is the emission at the end of that sample, the one that is scored.
         topic: of the camera, where there may be several.
         incomplete: packets are known to be missing from the window.
+        active_volumes: local volumes that have events; None where that was not counted.
         source_ns: when the packet that caused this emission was published, by its publisher's clock; 0 where
             that is unknown, or silence caused it.
     """
@@ -49,6 +50,7 @@ class Emission:
     topic: str = ""
     incomplete: bool = False
     source_ns: int = 0
+    active_volumes: int | None = None
 
     def __repr__(self) -> str:
         """One line: when, of what, and the prediction."""
@@ -73,30 +75,45 @@ class EmitPolicy:
     """How often features are emitted; never what they are.
 
     `events`: after every `every` events. `time`: whenever stream time passes a multiple of `every`
-    microseconds, counted from the origin. `auto`: as often as emissions take no more than a fifth of the
-    time. At the end of a labelled sample there is an emission under every policy.
+    microseconds, counted from the origin. `bin`: the same at each boundary of the model's time bins. `auto`:
+    as often as emissions take no more than a fifth of the time. At the end of a labelled sample there is an
+    emission under every policy.
 
     Example:
         >>> sf.EmitPolicy.parse("10ms")
         EmitPolicy(kind='time', every=10000)
     """
 
-    kind: Literal["events", "time", "auto"]
+    kind: Literal["events", "time", "bin", "auto"]
     every: int = 1
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `event`, `1000ev`, `10ms` (also `500us`, `2s`) or `auto`.
+        """Read `event`, `1000ev`, `10ms` (also `500us`, `2s`), `bin` or `auto`.
 
         Raises:
             InputError: the text is something else.
         """
         if text == "auto":
             return cls("auto")
+        if text == "bin":
+            return cls("bin")
         if text == "event":
             return cls("events", 1)
         match = re.fullmatch(r"([1-9][0-9]{0,11})(ev|us|ms|s)", text)
         if not match:
-            raise InputError(f"--emit {text!r} is not understood; give event, 1000ev, 10ms or auto")
+            raise InputError(f"--emit {text!r} is not understood; give event, 1000ev, 10ms, bin or auto")
         unit = {"ev": 1, "us": 1, "ms": 1_000, "s": 1_000_000}[match[2]]
         return cls("events" if match[2] == "ev" else "time", int(match[1]) * unit)
+
+    def __str__(self) -> str:
+        """As `parse` reads it."""
+        if self.kind == "events":
+            return "event" if self.every == 1 else f"{self.every}ev"
+        if self.kind == "time":
+            return f"{self.every // 1000}ms" if self.every % 1000 == 0 else f"{self.every}us"
+        return self.kind
+
+    def with_bins(self, bin_us: int) -> "EmitPolicy":
+        """The same for a model with bins of `bin_us` microseconds: `bin` becomes `time`."""
+        return EmitPolicy("time", bin_us) if self.kind == "bin" else self

@@ -47,6 +47,7 @@ class Outputs:
         n_features: int,
         labels: Sequence[str],
         *,
+        n_filters: int = 0,
         before: Callable[[], Sink[Emission]] | None = None,
         after: Callable[[], Sink[Emission]] | None = None,
         recording_sink: Callable[[Path], RecordingSink] = lambda path: RecordingSink(
@@ -58,6 +59,7 @@ class Outputs:
         Args:
             n_features: length of a feature vector.
             labels: names of the scores; empty without a classifier.
+            n_filters: of the encoder, where features are those of filters that a person may look up.
             before: opens a sink of the job's own that is written to before the others.
             after: opens one that is written to after them.
             recording_sink: opens the sink of `recording`.
@@ -67,7 +69,9 @@ class Outputs:
         """
         return open_sinks(
             before,
-            partial(TerminalSink, self.console, every_sample=self.every_sample) if self.console else None,
+            partial(TerminalSink, self.console, every_sample=self.every_sample, n_filters=n_filters)
+            if self.console
+            else None,
             partial(JsonLinesSink, self.json_lines, features=self.with_features) if self.json_lines else None,
             partial(recording_sink, self.recording) if self.recording else None,
             partial(TableSink, self.table, n_features, labels) if self.table else None,

@@ -12,6 +12,7 @@ from typing import Any
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.recordings.opening import RecordingPath
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
@@ -50,6 +51,7 @@ class ReplayJob:
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
         engine: makes the engines, see `Session`.
+        threads: that share a large emission, see `usable_threads`.
 
     Attributes:
         advice: a line where the work on the first second took longer than the second.
@@ -66,7 +68,7 @@ class ReplayJob:
         model: ModelSource | None = None,
         classifier: ClassifierSource | None = None,
         *,
-        emit: str | EmitPolicy = "auto",
+        emit: str | EmitPolicy = "bin",
         speed: float | None = None,
         topic: str | None = None,
         reading: ReadOptions = AS_IT_IS,
@@ -74,6 +76,7 @@ class ReplayJob:
         loop: bool = False,
         learn_online: bool = False,
         engine: Callable[..., Engine] = Engine,
+        threads: int | None = None,
     ) -> None:
         """Open and check everything, so that nothing is written when something does not fit."""
         self._policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
@@ -102,8 +105,9 @@ class ReplayJob:
             clock=time.perf_counter,
             engine=engine,
             load=Load(self._encoder.geometry, self.advice.append),
+            threads=usable_threads(threads),
         )
-        self._seconds = 0.0
+        self._seconds = self._compile_seconds = 0.0
         self.interrupted = False
         self._played: Recording | None = None
         self._pipeline: Pipeline[Packet | Label, Emission] | None = None
@@ -114,8 +118,11 @@ class ReplayJob:
         self, sinks: Callable[[], Sequence[Sink[Emission]]]
     ) -> Iterator[Pipeline[Packet | Label, Emission]]:
         """The pipeline of this replay into some sinks, with the recording open as long as the block runs."""
-        if self._speed is not None:
-            warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        started = time.perf_counter()
+        self._report("compiling", 0, 1, "kernels, kept for the next time")
+        warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        self._report("compiling", 1, 1, "")
+        self._compile_seconds = time.perf_counter() - started
         with self._opening() as rec:
             self._played = rec
             played = rec.played(
@@ -145,7 +152,8 @@ class ReplayJob:
 
             def sinks() -> Sequence[Sink[Emission]]:
                 held.enter_context(signals_wait())
-                return outputs.open(self._encoder.n_features, self._labels)
+                n_filters = self._encoder.n_filters
+                return outputs.open(self._encoder.n_features, self._labels, n_filters=n_filters)
 
             with self.opened(sinks) as pipeline:
                 started = time.perf_counter()
@@ -183,17 +191,23 @@ class ReplayJob:
             "events": stats.events,
             "seconds": round(self._seconds, 3),
             "events_per_s": round(stats.events / max(self._seconds, 1e-9)),
+            "compile_seconds": round(self._compile_seconds, 3),
             "emissions": stats.emissions,
+            "emit": str(self._session.policy),
             "samples": stats.samples,
         }
         if stats.correct is not None and stats.samples:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
-        if stats.unknown_labels:
-            result["unknown_labels"] = stats.unknown_labels
-        removed = dict(self.losses.removed)
+        result["unknown_labels"] = stats.unknown_labels
         return (
-            result | self.drops() | removed | {"saturated": stats.saturated, "interrupted": self.interrupted}
+            result
+            | self.drops()
+            | {
+                "removed": dict(self.losses.removed),
+                "saturated": stats.saturated,
+                "interrupted": self.interrupted,
+            }
         )
 
 
@@ -225,7 +239,7 @@ def checked_speed(speed: float | None) -> float | None:
     """The same speed.
 
     Raises:
-        InputError: it is no number above zero, and not None.
+        InputError: the speed is neither None nor a number above zero.
     """
     if speed is not None and not 0 < speed < 1e9:
         raise InputError(f"a speed of {speed} is not possible; give a number above zero, or None")
@@ -237,12 +251,13 @@ def replay(
     model: ModelSource | None = None,
     classifier: ClassifierSource | None = None,
     *,
-    emit: str | EmitPolicy = "auto",
+    emit: str | EmitPolicy = "bin",
     speed: float | None = None,
     topic: str | None = None,
     split: str | None = None,
     loop: bool = False,
     learn_online: bool = False,
+    threads: int | None = None,
 ) -> EmissionStream:
     """Replay a recording as an asynchronous iterator of emissions, those that `streamfeat replay` makes.
 
@@ -257,21 +272,22 @@ def replay(
         recording: path or URL; or an open recording, which stays open and is read in a thread meanwhile.
         model: path of the encoder, or the encoder; None for the general one that ships.
         classifier: path of a classifier, or the classifier; features alone without it.
-        emit: `event`, `1000ev`, `10ms` (stream time) or `auto`; or a policy.
+        emit: `event`, `1000ev`, `10ms` (stream time), `bin` (of the model) or `auto`; or a policy.
         speed: stream seconds for each second of the clock; None for as fast as the program takes them.
         topic: event topic, where there are several.
         split: replay only samples of this split.
         loop: start again at the end, with times that go on.
         learn_online: learn from each labelled sample after predicting it.
+        threads: that share a large emission; all cores but one if not given.
 
     Returns:
         the stream; nothing is opened before it is used. Iterating raises InputError where a file cannot be
         used or the parts do not fit each other.
 
     Raises:
-        InputError: `emit` or `speed` makes no sense.
+        InputError: `emit`, `speed` or `threads` makes no sense.
     """
     policy = emit if isinstance(emit, EmitPolicy) else EmitPolicy.parse(emit)
     options: dict[str, Any] = {"topic": topic, "split": split, "loop": loop, "learn_online": learn_online}
-    options |= {"emit": policy, "speed": checked_speed(speed)}
+    options |= {"emit": policy, "speed": checked_speed(speed), "threads": usable_threads(threads)}
     return EmissionStream(lambda: ReplayJob(recording, model, classifier, **options))

@@ -7,6 +7,7 @@ Not here: threads, queues, files, terminals (`pipeline`, `sinks`); the clock, wh
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,7 @@ class Session:
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
         load: times the work of the first second, if somebody is to be told that it is too much.
+        threads: of the engines, see `Engine`.
 
     Raises:
         InputError: the classifier does not fit the encoder.
@@ -81,12 +83,13 @@ class Session:
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
         load: Load | None = None,
+        threads: int = 1,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
         if classifier:
             classifier.check_fits(encoder)
         self.encoder = encoder
-        self.policy = policy
+        self.policy = policy = policy.with_bins(encoder.geometry.bin_us)
         self._every_event = policy == EmitPolicy("events", 1)
         if classifier and (learn_online or self._every_event):
             classifier = classifier.linear
@@ -95,7 +98,7 @@ class Session:
         self._clock, self._topic, self._load = clock, topic, load
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
-        self._make_engine = engine
+        self._make_engine = partial(engine, threads=threads)
         self.denoiser = Denoiser(denoising) if denoising else None
         self._engine: Engine | None = None
         every_us = policy.every if policy.kind == "time" else encoder.geometry.bin_us
@@ -296,7 +299,12 @@ class Session:
             topic=self._topic,
             incomplete=incomplete,
             source_ns=self._source_ns,
+            active_volumes=self._active_volumes(),
         )
+
+    def _active_volumes(self) -> int | None:
+        """Counting them is nothing beside an emission, but much beside one event."""
+        return self._engine.stats().active_volumes if self._engine and not self._every_event else None
 
     def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
         self._take(engine, events, latest)

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO, TypeVar
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
@@ -23,6 +24,9 @@ from streamfeat.stream.emission import Emission
 __all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record", "open_sinks"]
 
 _LINES_A_SECOND = 4.0
+_FILTERS_SHOWN = 3
+_ABSOLUTE_US = 86_400_000_000
+"""Stream times beyond a day are no time since a camera began."""
 
 T = TypeVar("T", contravariant=True)
 
@@ -169,19 +173,32 @@ class RecordingSink:
 
 
 class TerminalSink:
-    """A line for each labelled sample, or for each second without labels; never a flood.
+    """A line for each labelled sample, or of what happens between them; four a second, never a flood.
+
+    Without labels a line says how fast events come, how many local volumes have some, and, without a
+    classifier, which filters moved most since the line before. Times of a camera that counts from 1970 are
+    counted from the first emission.
 
     Args:
-        console: where to print.
+        console: where to print; what is too narrow for all gets the beginning.
         clock: seconds, monotonic.
         every_sample: show each labelled sample, however fast they come.
+        n_filters: of the encoder; 0 to say nothing of filters.
     """
 
     def __init__(
-        self, console: Console, clock: Callable[[], float] = time.monotonic, *, every_sample: bool = False
+        self,
+        console: Console,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        every_sample: bool = False,
+        n_filters: int = 0,
     ) -> None:
         """Start with nothing seen."""
         self._console = console
+        self._n_filters = n_filters
+        self._zero_us: int | None = None
+        self._before: dict[str, Emission] = {}
         self._every_sample = every_sample
         self._clock = clock
         self._next = 0.0
@@ -191,6 +208,9 @@ class TerminalSink:
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Count every emission, and show one where it is time to."""
+        if self._zero_us is None:
+            first_us = emissions[0].t_us
+            self._zero_us = first_us if first_us > _ABSOLUTE_US else 0
         finals = [e for e in emissions if e.final]
         if self._every_sample:
             for e in finals:
@@ -210,7 +230,7 @@ class TerminalSink:
         if self._clock() < self._next:
             return
         self._skipped -= shown.final
-        self._next = self._clock() + (1 / _LINES_A_SECOND if shown.final else 1.0)
+        self._next = self._clock() + 1 / _LINES_A_SECOND
         self._console.print(self._line(shown), highlight=False)
 
     def close(self, *, failed: bool) -> None:
@@ -219,15 +239,17 @@ class TerminalSink:
             self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
 
     def _line(self, e: Emission) -> Text:
-        line = Text()
-        line.append(f"{e.t_us / 1e6:8.2f} s ", style="dim")
+        line = Text(no_wrap=True, overflow="crop")
+        line.append(f"{(e.t_us - (self._zero_us or 0)) / 1e6:8.2f} s  ", style="dim")
         if e.topic:
             line.append(f"{e.topic}  ", style="cyan")
-        line.append(f"{e.n_events:>10,} events  ")
         if e.prediction is not None:
             first, second = sorted(e.scores, reverse=True)[:2]
             line.append(f"{e.prediction:<{max(map(len, e.labels))}}", style="bold")
             line.append(f" {first - second:+6.2f}  ", style="dim")
+        before = self._before.get(e.topic)
+        self._before[e.topic] = e
+        line.append(f"{_rate(before, e):>8}/s  ")
         if e.sample and e.final:
             if e.correct is None:
                 line.append(f"is {e.sample.label}")
@@ -237,9 +259,33 @@ class TerminalSink:
                 line.append(f"is {e.sample.label}", style="red")
             if e.labels:
                 line.append(f"  {100 * self._correct / self._samples:.1f} % of {self._samples}", style="dim")
-        elif e.prediction is None:
-            line.append("sum of features ", style="dim")
-            line.append(f"{float(abs(e.features).sum()):9.1f}")
+        elif e.active_volumes is not None:
+            line.append(f"{e.active_volumes:>6,} active", style="dim")
         if e.incomplete:
             line.append("  incomplete", style="yellow")
+        if e.prediction is None and self._n_filters:
+            line.append("  filters ", style="dim")
+            line.append(_moved(before, e, self._n_filters))
         return line
+
+
+def _rate(before: Emission | None, e: Emission) -> str:
+    """Events a second of stream time since the emission before, in four letters or less."""
+    passed_us = e.t_us - before.t_us if before else 0
+    if before is None or passed_us <= 0:
+        return "-"
+    rate = 1e6 * (e.n_events - before.n_events) / passed_us
+    for limit, unit, name in ((999.5e6, 1e9, "G"), (999.5e3, 1e6, "M"), (999.5, 1e3, "k")):
+        if rate >= limit:
+            value = rate / unit
+            return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}{name}"
+    return f"{rate:.0f}"
+
+
+def _moved(before: Emission | None, e: Emission, n_filters: int) -> str:
+    """The filters whose pooled codes rose (+) or fell (-) most, all cells and both signs together."""
+    change = e.features - before.features if before else e.features
+    of_filter = change.reshape(-1, n_filters).sum(axis=0)
+    most = np.argsort(-np.abs(of_filter), kind="stable")[:_FILTERS_SHOWN]
+    said = [f"{k + 1}{'+' if of_filter[k] > 0 else '-'}" for k in most.tolist() if of_filter[k]]
+    return " ".join(said) or "at rest"

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.engine.engine import Snapshot
+from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.events import Resolution
 from streamfeat.files.json_fields import Fields
@@ -55,7 +55,7 @@ class SessionStats:
         """Read what `asdict` wrote.
 
         Raises:
-            InputError: it is not that.
+            InputError: the values are not such counts.
         """
         names = [field.name for field in fields(cls) if field.name != "correct"]
         return cls(**{name: values.whole(name) for name in names}, correct=values.maybe("correct"))
@@ -202,7 +202,7 @@ class SessionState:
         """Read what `asdict` wrote, of a live stream.
 
         Raises:
-            InputError: it is not that, or no session could be there.
+            InputError: the values are not a state, or not one that a session can be in.
         """
         origin_us, last_us = (
             values.whole("origin_us", -_LATEST_US, _LATEST_US),

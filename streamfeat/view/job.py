@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
@@ -17,6 +17,7 @@ from typing import Any
 from streamfeat.classify.kernel import load_classifier
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import write_atomically
 from streamfeat.files.locations import Location
@@ -26,9 +27,11 @@ from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.warming import warm_up
+from streamfeat.view.labelling import LabelSheet
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
 from streamfeat.view.page import page
+from streamfeat.view.player import Piece
 from streamfeat.view.server import PageServer
 from streamfeat.view.sink import Shows, ViewSink, about
 from streamfeat.view.sources import PlayJob, WatchJob
@@ -67,6 +70,8 @@ class View:
         open_browser: show the page in a browser.
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
         loop: start a recording again at its end.
+        labels: labels of the recording that the page changes.
+        threads: that share a large emission, see `usable_threads`.
         say: told addresses, and what is waited for.
         options: further ones of `PlayJob`, `WatchJob` or `ListenJob`.
 
@@ -88,6 +93,8 @@ class View:
         open_browser: bool = False,
         speed: float | None = 1.0,
         loop: bool = False,
+        labels: LabelSheet | None = None,
+        threads: int | None = None,
         say: Callable[[str], None] = lambda line: None,
         **options: Any,
     ) -> None:
@@ -96,6 +103,7 @@ class View:
             raise InputError(f"--rate {rate:g} is not possible; give up to {_MAX_RATE:g} pictures a second")
         if classifier and not model:
             raise InputError("a classifier reads features: give the model it was trained with, too (-m)")
+        threads = usable_threads(threads)
         self._encoder = Encoder.load(model) if model else None
         self._policy = EmitPolicy.parse(emit)
         reader = load_classifier(classifier) if classifier else None
@@ -109,6 +117,7 @@ class View:
         self._is_recording = isinstance(source, Location)
         self._boards: list[Shows] = []
         self._page: PageServer | None = None
+        self._sheet = labels
         self._sink = ViewSink(
             self._boards,
             self._encoder,
@@ -129,8 +138,10 @@ class View:
                 loop=loop,
                 stays=self._is_served,
                 make_engine=self._engine_of(""),
+                threads=threads,
                 on_player=self._tell("player"),
                 on_timeline=self._tell("timeline") if web_port is not None else None,
+                on_pieces=self._place,
                 **options,
             )
         elif model:
@@ -140,6 +151,7 @@ class View:
                 classifier,
                 emit=emit,
                 engine_of=self._engine_of,
+                threads=threads,
                 tap=self._tap.items,
                 publish=False,
                 **options,
@@ -198,7 +210,8 @@ class View:
 
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
-        return self._job.result() | {"frames": self._sink.frames, "frames_skipped": self._sink.skipped}
+        result = self._job.result() | {"frames": self._sink.frames, "frames_skipped": self._sink.skipped}
+        return result | (self._sheet.result() if self._sheet else {})
 
     def _open(self, opened: ExitStack) -> None:
         """Open what is shown on."""
@@ -225,6 +238,7 @@ class View:
             self._boards.append(server)
             self._page = server
             server.record("", "about", 0, known | {"recording": self._is_recording})
+            self._show_labels()
             self._say(f"page: {server.address}")
             if self._open_browser:
                 Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
@@ -238,9 +252,23 @@ class View:
 
         return tell
 
+    def _place(self, pieces: Sequence[Piece], end_us: int) -> None:
+        """Tell labels which stream time is played when."""
+        if self._sheet:
+            self._sheet.read_to(pieces, end_us)
+            self._show_labels()
+
+    def _show_labels(self) -> None:
+        if self._sheet:
+            self._tell("labels")(self._sheet.record())
+
     def _asked(self, asked: dict[str, Any]) -> None:
         """Do what a button of the page asks for; what makes no sense is left alone."""
         if not isinstance(self._job, PlayJob):
+            return
+        if self._sheet and asked["op"] in LabelSheet.OPERATIONS:
+            self._sheet.do(asked)
+            self._show_labels()
             return
         player, op, value = self._job.player, asked["op"], asked.get("value")
         number = float(value) if isinstance(value, int | float) and 0 <= value < 1e9 else None

@@ -19,6 +19,8 @@ def page(port: int, token: str) -> str:
         ("/* stream */", "stream.js"),
         ("/* plots */", "plots.js"),
         ("/* panels */", "panels.js"),
+        ("/* player */", "player.js"),
+        ("/* labels */", "labels.js"),
     ):
         text = text.replace(mark, (parts / name).read_text("utf-8"))
     return text.replace("STREAM_PORT", str(port)).replace("STREAM_TOKEN", token)

@@ -8,8 +8,8 @@ seconds, counts as none, so that a camera's clock that starts anew neither stops
 """
 
 import time
-from collections.abc import Callable, Generator, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
 from threading import Condition, Thread
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from streamfeat.events import Events
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.reader import Losses, Recording
 
-__all__ = ["Player", "Timeline", "items_between"]
+__all__ = ["Piece", "Player", "Timeline", "items_between"]
 
 _SLICE_US = 10_000
 """Packets are cut to this length of the clock, so that a picture never waits for the end of a long one."""
@@ -28,24 +28,54 @@ _JUMP_US = 10_000_000
 _NEW_EPOCH = 1 << 20
 """Added to the epoch of each packet once for each seek: more than a recording has restarts."""
 _MOST_COLUMNS = 1024
+_MOST_PIECES = 4_096
 
 Item = Packet | Label
 Outcome = Literal["go", "seek", "stop", "end"]
 
 
+@dataclass(slots=True)
+class Piece:
+    """Played time in which it goes on as stream time does.
+
+    Attributes:
+        played_us: at its start.
+        stream_us: at its start.
+        stream_end_us: as far as it goes.
+    """
+
+    played_us: int
+    stream_us: int
+    stream_end_us: int
+
+
 class PlayedTime:
-    """Time that has been played when a batch has been shown, in microseconds."""
+    """Time that has been played when a batch has been shown, in microseconds.
+
+    Attributes:
+        us: played so far.
+        pieces: which stream time was played when, in order; of a stream that jumps on and on the first 4,096.
+    """
 
     def __init__(self) -> None:
         """Nothing was played."""
         self.us = 0
+        self.pieces: list[Piece] = []
         self._last_us: int | None = None
 
     def add(self, events: Events) -> int:
         """Go on to the end of a batch, which has an event at least."""
         latest = int(events["t"].max())
-        step = latest - (int(events["t"].min()) if self._last_us is None else self._last_us)
-        self.us += step if 0 <= step <= _JUMP_US else 0
+        before = int(events["t"].min()) if self._last_us is None else self._last_us
+        step = latest - before
+        goes_on = 0 <= step <= _JUMP_US
+        if self._last_us is None:
+            self.pieces.append(Piece(0, before, latest))
+        elif goes_on:
+            self.pieces[-1].stream_end_us = latest
+        elif len(self.pieces) < _MOST_PIECES:
+            self.pieces.append(Piece(self.us, latest, latest))
+        self.us += step if goes_on else 0
         self._last_us = latest
         return self.us
 
@@ -235,11 +265,17 @@ class Timeline:
     Args:
         opening: opens the recording once more.
         tell: called now and then with seconds of a column, counts of events, and whether that is all.
+        place: called before it with which stream time is played when, and the played time that was read.
     """
 
-    def __init__(self, opening: Callable[[], Recording], tell: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(
+        self,
+        opening: Callable[[], Recording],
+        tell: Callable[[dict[str, Any]], None],
+        place: Callable[[Sequence[Piece], int], None] = lambda pieces, end_us: None,
+    ) -> None:
         """Begin to count."""
-        self._opening, self._tell = opening, tell
+        self._opening, self._tell, self._place = opening, tell, place
         self._stopped = False
         self._thread = Thread(target=self._count, name="timeline", daemon=True)
         self._thread.start()
@@ -269,8 +305,10 @@ class Timeline:
                 counts += np.bincount(columns, minlength=_MOST_COLUMNS)
                 if started > told + 0.5:
                     told = started
+                    self._place([replace(piece) for piece in played.pieces], at_us)
                     self._tell(self._record(counts, column_us, at_us, done=False))
                 time.sleep(min(time.monotonic() - started, 0.1))
+        self._place(played.pieces, played.us)
         self._tell(self._record(counts, column_us, played.us, done=True))
 
     @staticmethod

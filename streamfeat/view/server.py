@@ -223,7 +223,7 @@ class _Browser:
 
 
 def _read(text: str | bytes) -> dict[str, Any] | None:
-    """A browser's message, or None if it is none."""
+    """A browser's message; None if it is not one of this page."""
     try:
         asked = json.loads(text)
     except (ValueError, RecursionError):

@@ -5,7 +5,7 @@ Not here: pictures and boards (`sink`), the player itself (`player`), listening 
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,7 @@ from streamfeat.stream.replay import items_of_split
 from streamfeat.stream.session import Session
 from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import Sink
-from streamfeat.view.player import Player, Timeline
+from streamfeat.view.player import Piece, Player, Timeline
 from streamfeat.view.tap import EventTap
 
 __all__ = ["PlayJob", "WatchJob"]
@@ -69,8 +69,10 @@ class PlayJob:
         topic: event topic, where there are several.
         reading: how to read what is no MCAP, and what to take out.
         make_engine: makes the engines, see `Session`.
+        threads: of the engines, see `Session`.
         on_player: told what the page shows of the player.
         on_timeline: told the event rate over the recording; without it, it is not counted.
+        on_pieces: told which stream time is played when, see `Timeline`.
 
     Raises:
         InputError: the recording cannot be used, or the parts do not fit each other.
@@ -90,12 +92,14 @@ class PlayJob:
         topic: str | None = None,
         reading: ReadOptions = AS_IT_IS,
         make_engine: Callable[..., Engine] = Engine,
+        threads: int = 1,
         on_player: Callable[[dict[str, Any]], None] = lambda state: None,
         on_timeline: Callable[[dict[str, Any]], None] | None = None,
+        on_pieces: Callable[[Sequence[Piece], int], None] = lambda pieces, end_us: None,
     ) -> None:
         """Open and check everything."""
         self._opening: Callable[[], Recording] = partial(open_recording, source, topic, reading)
-        self._on_timeline = on_timeline
+        self._on_timeline, self._on_pieces = on_timeline, on_pieces
         with self._opening() as recording:
             self.assumptions = recording.assumptions
             if encoder:
@@ -103,7 +107,7 @@ class PlayJob:
             if split is not None and split not in {label.split for label in recording.labels}:
                 raise InputError(f"{source}: has no samples of split {split!r}")
         self._session = (
-            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine)
+            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine, threads=threads)
             if encoder
             else None
         )
@@ -120,7 +124,7 @@ class PlayJob:
 
     def run(self, tap: EventTap, sink: Sink[Emission]) -> None:
         """Play until the end, `stop`, SIGINT or SIGTERM."""
-        timeline = Timeline(self._opening, self._on_timeline) if self._on_timeline else None
+        timeline = Timeline(self._opening, self._on_timeline, self._on_pieces) if self._on_timeline else None
         started = time.perf_counter()
         try:
             with signals_wait():

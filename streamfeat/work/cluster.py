@@ -46,7 +46,7 @@ _AHEAD = 3
 """Pieces of work for each thread that are with the workers or waiting for them."""
 _FAN_IN = 4
 _PACKAGES = ("streamfeat", "numpy", "numba")
-"""What decides, with Python, what comes out."""
+"""Packages that results depend on, beside Python."""
 
 _SETTINGS = {
     "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
@@ -65,7 +65,7 @@ class Cluster:
 
     Attributes:
         client: the same.
-        versions: of what decides, here, what comes out.
+        versions: of the packages here that results depend on.
     """
 
     def __init__(self, client: Client) -> None:
@@ -143,7 +143,7 @@ class Cluster:
         return max(1, threads)
 
     def _result(self, future: Future) -> Any:
-        """Wait for a result, as long as there is somebody to work on it."""
+        """Wait for a result, as long as there is a worker."""
         while True:
             try:
                 return future.result(timeout=_PATIENCE_S)
@@ -174,7 +174,7 @@ def connected(address: str) -> Iterator[Cluster]:
     """The workers of the scheduler at an address, such as `tcp://10.0.0.1:8786`.
 
     Raises:
-        InputError: nobody answers there, there are no workers, or they have other versions.
+        InputError: no scheduler answers there, it has no workers, or they have other versions.
     """
     with dask.config.set(_SETTINGS):
         try:
@@ -217,7 +217,7 @@ def local(n_workers: int, threads: int | None = None) -> Iterator[Cluster]:
 
 @contextmanager
 def _ctrl_c_ignored() -> Iterator[None]:
-    """Processes that are started here do not hear Ctrl-C of the terminal; whoever started them ends them."""
+    """Processes that are started here do not hear Ctrl-C of the terminal; this process ends them."""
     if current_thread() is not main_thread():
         yield
         return
@@ -284,7 +284,7 @@ def _worked(asked: dict[str, str], function: Callable[..., R], *values: Any) -> 
 
 @contextmanager
 def one_line() -> Iterator[None]:
-    """What can go wrong with a cluster, as one line."""
+    """The failure of a cluster as one line."""
     try:
         yield
     except KilledWorker as error:

@@ -1,6 +1,6 @@
 """Work on a cluster that does not end by itself.
 
-Lives here: beginning it, hearing of it, ending it, and how it learns that nobody wants it any more.
+Lives here: beginning it, hearing of it, ending it, and how it learns that it is not wanted any more.
 Not here: which worker does it, and which goes on when that dies: Dask decides (`cluster`).
 """
 
@@ -18,7 +18,7 @@ __all__ = ["Service", "Services", "UnansweredError"]
 
 
 class UnansweredError(InputError):
-    """A worker did not hear from the scheduler, and ended what nobody had ended."""
+    """A worker lost its scheduler and ended its services, which their owner had not ended."""
 
 
 class Services:
@@ -38,7 +38,7 @@ class Services:
         self._client.subscribe_topic(self._id, lambda event: on_told(*event[1]))
 
     def begin(self, name: str, function: Callable[..., Any], *values: Any) -> None:
-        """Run `function(service, *values)` on some worker, with an `Service`.
+        """Run `function(service, *values)` on some worker, with a `Service`.
 
         Args:
             name: of the service; one that has begun is not begun again.
@@ -78,7 +78,7 @@ class Services:
 
 
 class Service:
-    """What a function that runs as an service is given.
+    """The view that a service's function has of its run.
 
     Args:
         run_id: of the services that it is one of.
@@ -95,7 +95,7 @@ class Service:
         """It ended because the scheduler did not answer: that may be there again, and take it for done."""
 
     def is_wanted(self) -> bool:
-        """Whether nobody has ended it: neither whoever began it, nor the scheduler, nor the loss of both."""
+        """Whether it goes on: neither its owner nor the scheduler has ended it, and neither is lost."""
         task = self._worker.state.tasks.get(self._key)
         if task is None or task.state == "cancelled":
             return False
@@ -106,7 +106,7 @@ class Service:
             return False
 
     def tell(self, what: dict[str, Any]) -> None:
-        """Tell whoever began it."""
+        """Tell its owner."""
         self._worker.log_event(self._id, (self._name, self._worker.address, what))
 
 

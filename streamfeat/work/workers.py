@@ -24,7 +24,7 @@ __all__ = ["THIS_PROCESS", "Sums", "ThreadWorkers", "Workers", "add_sums", "one_
 
 R = TypeVar("R")
 Sums = tuple[NDArray[np.float64], ...]
-"""What is added up, array by array."""
+"""Sums: arrays that are added up one by one."""
 
 
 class Workers(Protocol):
@@ -101,7 +101,7 @@ class ThreadWorkers:
 
 
 THIS_PROCESS = ThreadWorkers()
-"""Where work is done unless somebody says otherwise."""
+"""Where work is done by default."""
 
 
 def add_sums(*parts: Sums) -> Sums:

@@ -26,6 +26,7 @@ from streamfeat.convert.datasets import convert
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events
 from streamfeat.messages.cdr import EventArray, LabelMessage
 from streamfeat.recordings.reader import Label, Packet, open_recording
@@ -123,23 +124,9 @@ def _recover_recording(data: bytes) -> bytes:
 # --- models and classifiers
 
 
-def _tiny_model(formulation: Any, encoding: Any) -> Encoder:
-    rng = np.random.default_rng(1)
-    d = _TINY.entries
-    return Encoder.build(
-        _TINY,
-        formulation=formulation,
-        encoding=encoding,
-        threshold=0.3,
-        filters=rng.standard_normal((3, d)),
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
-
-
 def _model_seeds() -> list[bytes]:
     kinds = [("direct", "split"), ("direct", "triangle"), ("inverse", "soft"), ("inverse", "split")]
-    return [_written(_tiny_model(*kind).save) for kind in kinds]
+    return [_written(random_encoder(1, _TINY, 3, *kind, threshold=0.3).save) for kind in kinds]
 
 
 def _load_model(data: bytes) -> bytes:

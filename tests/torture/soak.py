@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
@@ -56,19 +57,8 @@ def soak(trials: Trials) -> list[Row]:
 
 
 def _encoder(seed: int) -> Encoder:
-    rng = np.random.default_rng(seed)
     geometry = Geometry(patch=8, stride=4, n_bins=3, bin_us=33_334, max_count=2)
-    d = geometry.entries
-    filters = rng.standard_normal((32, d))
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.5,
-        filters=filters / np.linalg.norm(filters, axis=1, keepdims=True),
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
+    return random_encoder(seed, geometry, 32, encoding="split", threshold=0.5)
 
 
 def _stream(packets: int, seed: int) -> Iterator[Packet | Watermark]:
@@ -122,10 +112,10 @@ class _Watch:
     def process(self, item: Packet | Watermark) -> Iterator[Emission]:
         """Time what the session does with an item, and look from time to time."""
         cpu, wall = 0.0, 0.0
-        readings = self.session.process(item)
+        emissions = self.session.process(item)
         while True:
             before = time.thread_time(), time.perf_counter()
-            emission = next(readings, None)
+            emission = next(emissions, None)
             cpu, wall = cpu + time.thread_time() - before[0], wall + time.perf_counter() - before[1]
             if emission is None:
                 break
@@ -192,7 +182,7 @@ class _Watch:
             self._checks - len(self._wrong),
             lost,
             seconds=seconds,
-            note=f"bit for bit; {self._emissions:,} readings",
+            note=f"bit for bit; {self._emissions:,} emissions",
             failures=tuple(self._wrong),
         )
         return [exact, self._steady(what), self._latency(what)]

@@ -14,6 +14,7 @@ import numpy as np
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events, make_events
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
@@ -86,26 +87,15 @@ def state(trials: Trials) -> list[Row]:
             0 if not failures else None,
             recovery_s=median(recoveries) if recoveries else None,
             seconds=time.monotonic() - began,
-            note=f"--reliable; readings have the bits of a run that never stopped; {again:,} made twice",
+            note=f"--reliable; emissions have the bits of a run that never stopped; {again:,} made twice",
             failures=tuple(failures),
         )
     ]
 
 
 def _encoder(seed: int) -> Encoder:
-    rng = np.random.default_rng(seed)
     geometry = Geometry(patch=8, stride=4, n_bins=3, bin_us=33_334, max_count=2)
-    d = geometry.entries
-    filters = rng.standard_normal((16, d)) / np.sqrt(d)
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.3,
-        filters=filters,
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
+    return random_encoder(seed, geometry, 16, encoding="split", threshold=0.3)
 
 
 def _sent(i: int) -> Events:
@@ -117,7 +107,7 @@ def _sent(i: int) -> Events:
 def _once(
     nursery: Nursery, encoder: Encoder, model: Path, folder: Path, rng: np.random.Generator
 ) -> tuple[int, list[float]]:
-    """One stream, its listener killed on the way: readings made twice, and seconds to the next."""
+    """One stream, its listener killed on the way: emissions made twice, and seconds to the next."""
     port, kept = free_port(), folder / "state"
     moments = {int(n) for n in rng.choice(np.arange(2, _PACKETS - 2), _KILLS, replace=False)}
     words = ["@listener", model, kept, port]
@@ -133,40 +123,40 @@ def _once(
             camera.put(EventPacket(0, "", *_SIDES, i, base_ns, "mono", False, payload).to_cdr())
             time.sleep(float(rng.uniform(0, 0.02)))
             if i in moments:
-                # Packet 1 brings about the first reading, and each later one the next.
-                _until(lambda: _readings(lives[-1]), child.log)
+                # Packet 1 brings about the first emission, and each later one the next.
+                _until(lambda: _emissions(lives[-1]), child.log)
                 took += [time.monotonic() - started] * (started > 0)
                 child.kill(float(rng.uniform(0, 0.05)))
                 started = time.monotonic()
                 lives.append(folder / f"life{len(lives)}")
                 child = nursery.start(words, lives[-1])
-            elif started and _readings(lives[-1]):
+            elif started and _emissions(lives[-1]):
                 took.append(time.monotonic() - started)
                 started = 0.0
-        _until(lambda: _readings(lives[-1]), child.log)
+        _until(lambda: _emissions(lives[-1]), child.log)
         took += [time.monotonic() - started] * (started > 0)
         session_of_plain = Session(encoder, EmitPolicy.parse("10ms"))
         packets = [Packet(KEY, _sent(i), _SIDES, 0, i) for i in range(_PACKETS)]
         expected = [e for packet in packets for e in session_of_plain.process(packet)]
-        _until(lambda: any(r["t_us"] == expected[-1].t_us for r in _readings(lives[-1])), child.log)
+        _until(lambda: any(r["t_us"] == expected[-1].t_us for r in _emissions(lives[-1])), child.log)
         child.send(15)
         child.wait()
         camera.close()
-    got = [reading for life in lives for reading in _readings(life)]
-    by_time = {reading["t_us"]: reading for reading in got}
+    got = [emission for life in lives for emission in _emissions(life)]
+    by_time = {emission["t_us"]: emission for emission in got}
     for e in expected:
-        assert e.t_us in by_time, f"no reading at {e.t_us} us"
-    for reading in got:
-        assert not reading.get("incomplete"), f"incomplete at {reading['t_us']} us"
+        assert e.t_us in by_time, f"no emission at {e.t_us} us"
+    for emission in got:
+        assert not emission.get("incomplete"), f"incomplete at {emission['t_us']} us"
     bits = {e.t_us: e.features.tobytes() for e in expected}
-    for reading in got:
-        if reading["t_us"] in bits:
-            features = np.array(reading["features"], np.float32).tobytes()
-            assert features == bits[reading["t_us"]], f"other features at {reading['t_us']} us"
+    for emission in got:
+        if emission["t_us"] in bits:
+            features = np.array(emission["features"], np.float32).tobytes()
+            assert features == bits[emission["t_us"]], f"other features at {emission['t_us']} us"
     return len(got) - len(by_time), took
 
 
-def _readings(log: Path) -> list[dict]:  # type: ignore[type-arg]
+def _emissions(log: Path) -> list[dict]:  # type: ignore[type-arg]
     """Whole lines; the last may have been cut off."""
     lines = log.read_bytes().splitlines(keepends=True) if log.exists() else []
     return [json.loads(line) for line in lines if line.endswith(b"\n") and line.startswith(b"{")]

@@ -19,6 +19,7 @@ import numpy as np
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
@@ -84,17 +85,7 @@ class Target:
 def tiny_encoder() -> Encoder:
     """A small encoder of random filters: patches of 4x4 in two bins of 50 ms."""
     geometry = Geometry(patch=4, stride=4, n_bins=2, bin_us=50_000, max_count=2)
-    rng = np.random.default_rng(0)
-    d = geometry.entries
-    return Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="split",
-        threshold=0.3,
-        filters=rng.standard_normal((5, d)) / np.sqrt(d),
-        whitening=np.eye(d),
-        mean=0.1 * rng.standard_normal(d),
-    )
+    return random_encoder(0, geometry, 5, encoding="split", threshold=0.3)
 
 
 @functools.cache

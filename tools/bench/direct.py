@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 import streamfeat as sf
 from streamfeat.engine.operator import with_fixed_point
 from tools.bench.floor import BUILDS, Floor, Walks, compile_floor, quadrants
-from tools.bench.material import Burst, Setting, Updates, random_encoder
+from tools.bench.material import Burst, Setting, Updates, encoder_of_volumes
 from tools.bench.timing import WALL, Contestant, Race, race
 
 __all__ = ["measure_floors", "measure_peers"]
@@ -49,7 +49,7 @@ def measure_floors(setting: Setting) -> dict[str, Any]:
     """Our update against the same in C and against its bytes."""
     geometry = setting.geometry(stride=12)
     burst = setting.material.burst(geometry, BURST)
-    encoder = random_encoder(setting.material, geometry, setting.n_filters)
+    encoder = encoder_of_volumes(setting.material, geometry, setting.n_filters)
     ours, updates, half_way = follower(burst, encoder)
     contestants = {"ours": ours}
     volumes = updates.volumes(geometry, burst.resolution)
@@ -148,7 +148,7 @@ def measure_peers(setting: Setting) -> dict[str, Any]:
     """Our update in each encoding and with overlapping volumes, against computing features otherwise."""
     sparse, dense = setting.geometry(stride=12), setting.geometry(stride=4)
     burst = setting.material.burst(sparse, 20 if setting.quick else BURST)
-    encoder = random_encoder(setting.material, sparse, setting.n_filters)
+    encoder = encoder_of_volumes(setting.material, sparse, setting.n_filters)
     contestants: dict[str, Contestant] = {}
     updates: dict[str, Any] = {}
     for name, geometry, encoding in (

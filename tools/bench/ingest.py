@@ -1,6 +1,6 @@
 """Ingest alone: counting events into the ring, against voxel grids of the same events.
 
-Lives here: the part `ingest`. Not here: reading features.
+Lives here: the part `ingest`. Not here: emissions.
 
 Each library gets the events as it likes them best, prepared outside the timed run: tonic a structured array
 of int64 (it changes polarities in place, so each run has its copy), eventcv its own stream.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import streamfeat as sf
-from tools.bench.material import Setting, random_encoder
+from tools.bench.material import Setting, encoder_of_volumes
 from tools.bench.timing import PROCESS, Contestant, race
 
 __all__ = ["measure_ingest"]
@@ -22,7 +22,7 @@ def measure_ingest(setting: Setting) -> dict[str, Any]:
     """Nanoseconds an event of `Engine.feed`, tonic's and eventcv's voxel grid."""
     events, resolution = setting.material.stream(10_000 if setting.quick else 200_000)
     geometry = setting.geometry(stride=4)
-    encoder = random_encoder(setting.material, geometry, 32)
+    encoder = encoder_of_volumes(setting.material, geometry, 32)
     origin = int(events["t"].min())
     engine = sf.Engine(encoder, resolution, origin_us=origin)
     height, width = resolution

@@ -15,7 +15,7 @@ import numpy as np
 
 import streamfeat as sf
 from streamfeat.recordings.reader import Packet
-from tools.bench.material import Setting, random_encoder
+from tools.bench.material import Setting, encoder_of_volumes
 
 __all__ = ["measure_latency"]
 
@@ -28,7 +28,7 @@ def measure_latency(setting: Setting) -> dict[str, Any]:
     from streamfeat.latency.update import walk
 
     warm_up, most, runs = (100, 500, 2) if setting.quick else (5000, 30_000, 7)
-    encoder = random_encoder(setting.material, setting.geometry(stride=4), setting.n_filters)
+    encoder = encoder_of_volumes(setting.material, setting.geometry(stride=4), setting.n_filters)
     items = _first_items(setting, encoder.geometry, warm_up + most)
     taken: dict[str, list[Any]] = {"looking ahead": [], "one plane": []}
     setting.say(f"{runs} runs of {most:,} events each way")

@@ -24,7 +24,7 @@ from streamfeat.learn.volumes import sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recordings.reader import Label, Sample
 
-__all__ = ["Burst", "Material", "Setting", "Updates", "encoder_of", "random_encoder"]
+__all__ = ["Burst", "Material", "Setting", "Updates", "encoder_of", "encoder_of_volumes"]
 
 _MOST_EVENTS = 2_000_000  # of a recording without labels
 
@@ -115,7 +115,7 @@ class Updates:
         newest = int(burst.events["t"].max())
         counts = count_window(geometry, burst.before, burst.resolution, burst.origin_us, newest)
         unclipped = count_window(
-            sf.Geometry(**_fields(geometry) | {"max_count": 2**15 - 1}),
+            sf.Geometry(**_fields(geometry) | {"max_count": 2**14 - 1}),
             burst.before,
             burst.resolution,
             burst.origin_us,
@@ -243,7 +243,7 @@ class Material:
             return sample_volumes(few, geometry, n, (0,)).counts
 
 
-def random_encoder(
+def encoder_of_volumes(
     material: Material,
     geometry: sf.Geometry,
     n_filters: int,

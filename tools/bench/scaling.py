@@ -13,8 +13,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import streamfeat as sf
+from streamfeat.engine.random_encoder import random_encoder
 from tools.bench.direct import follower
-from tools.bench.material import Setting, random_encoder
+from tools.bench.material import Setting, encoder_of_volumes
 from tools.bench.timing import Contestant, race
 
 __all__ = ["measure_scaling"]
@@ -70,7 +71,7 @@ def _inverse(setting: Setting) -> dict[str, Any]:
     for k in INVERSE[: 2 if setting.quick else None]:
         burst = setting.material.burst(geometry, 10 if setting.quick else 40)
         for formulation, parameters in (("direct", {}), ("inverse", {"gap": 1e-4})):
-            encoder = random_encoder(setting.material, geometry, k, formulation, **parameters)
+            encoder = encoder_of_volumes(setting.material, geometry, k, formulation, **parameters)
             contestants[f"{formulation} {k}"], _, _ = follower(burst, encoder)
     result = race(contestants, setting.rounds(5))
     return {
@@ -85,17 +86,7 @@ def _inverse(setting: Setting) -> dict[str, Any]:
 
 def flat_encoder(geometry: sf.Geometry, n_filters: int) -> sf.Encoder:
     """Random filters without whitening: the direct formulation costs the same whatever they are."""
-    d = geometry.entries
-    filters = np.random.default_rng(0).normal(size=(n_filters, d)) / np.sqrt(d)
-    return sf.Encoder.build(
-        geometry,
-        formulation="direct",
-        encoding="soft",
-        threshold=0.5,
-        filters=filters,
-        whitening=np.eye(d),
-        mean=np.zeros(d),
-    )
+    return random_encoder(0, geometry, n_filters, threshold=0.5)
 
 
 def _product(encoder: sf.Encoder) -> Contestant:

@@ -12,7 +12,7 @@ from sklearn.linear_model import SGDClassifier
 from threadpoolctl import threadpool_limits
 
 import streamfeat as sf
-from tools.bench.material import Setting, random_encoder
+from tools.bench.material import Setting, encoder_of_volumes
 from tools.bench.timing import Contestant, race
 
 __all__ = ["measure_learning"]
@@ -23,7 +23,7 @@ BATCH = 16
 def measure_learning(setting: Setting) -> dict[str, Any]:
     """Nanoseconds a sample of one step, on pooled features of real samples."""
     geometry = setting.geometry(stride=12)
-    encoder = random_encoder(setting.material, geometry, setting.n_filters)
+    encoder = encoder_of_volumes(setting.material, geometry, setting.n_filters)
     samples = setting.material.fitting(geometry.patch)[:BATCH]
     features = np.stack(
         [

@@ -80,7 +80,7 @@ def measure_latency(arguments: Namespace) -> dict[str, Any]:
         camera.close()
         result = finish(one)
     ends = np.array([last for last, *_ in packets])
-    # The packet that completes a reading is the first whose events reach beyond it.
+    # The packet that completes an emission is the first whose events reach beyond it.
     seen = [
         arrived - when[index]
         for arrived, t_us, _ in reader.features
@@ -90,7 +90,7 @@ def measure_latency(arguments: Namespace) -> dict[str, Any]:
     return {
         "packets": len(packets),
         "events_per_packet": round(float(np.mean([n for _, n, _ in packets]))),
-        "readings": len(seen),
+        "emissions": len(seen),
         "emission_alone_p50_ms": _share(alone, 50),
         "emission_alone_p99_ms": _share(alone, 99),
         "features_p50_ms": _share(seen, 50),
@@ -126,13 +126,13 @@ def _put_at_pace(packets: list[tuple[int, int, bytes]], put: Callable[[bytes], N
 
 
 def _emission_seconds(model: Path, slices: list[Events]) -> list[float]:
-    """What the packets that bring a reading cost by themselves: no network, no pipeline."""
+    """What the packets that bring an emission cost by themselves: no network, no pipeline."""
     session = Session(Encoder.load(model), EmitPolicy.parse("10ms"))
     spent = []
     for part in slices:
         started = time.perf_counter()
-        readings = len(list(session.process(Packet("", part, FRAME, 0, 0))))
-        if readings:
+        emissions = len(list(session.process(Packet("", part, FRAME, 0, 0))))
+        if emissions:
             spent.append(time.perf_counter() - started)
     return spent
 

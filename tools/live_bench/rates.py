@@ -89,7 +89,7 @@ def _at_rate(arguments: Namespace, rate: float, seconds: float, emit: str = "aut
         "lost": result["lost"],
         "dropped": result["dropped"],
         "unaccounted": n - sum(result[name] for name in ("packets", "lost", "dropped", "unheard")),
-        "readings": result["emissions"],
+        "emissions": result["emissions"],
         "incomplete": result["incomplete"],
         "last_features_after_s": round(behind_s, 3),
         "end_to_end_p50_ms": result.get("end_to_end_p50_ms"),

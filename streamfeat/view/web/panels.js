@@ -69,10 +69,9 @@ const listener = {
     }
     const { last } = model.cameras.get(camera);
     last[channel] = message;
-    if (channel === "player") {
-      at("player").hidden = false;
-      return;
-    }
+    if (channel === "player") at("player").hidden = false;
+    if (channel === "labels") showLabelling();
+    if (channel === "player" || channel === "labels") return;
     if (camera !== model.camera) return;
     if (channel === "events" || channel === "status") heardMs = performance.now();
     if (channel === "status") {
@@ -122,6 +121,7 @@ function drawAll() {
     ? `${model.absolute ? "camera" : "stream"} time ${(status.t_s - startS).toFixed(2)} s`
     : "";
   drawPlayer(last);
+  if (last.labels) drawLabelling(last.labels);
   if (events) at("events-note").textContent = "the latest event of each pixel";
   const binMs = about?.bin_us ? Number(about.bin_us) / 1000 : 0;
   const ms = (value) => `${number(Math.round(value * 10) / 10)} ms`;
@@ -275,7 +275,9 @@ function tellState() {
   const state = at("state");
   const live = open && model.frames && quiet < QUIET_MS;
   state.className = live ? "live" : "";
+  const player = lastOf("player");
   if (!open) state.textContent = "connection lost, trying again";
+  else if (player?.ended || player?.paused) state.textContent = player.ended ? "at the end" : "paused";
   else if (!model.frames) state.textContent = "connected, waiting for events";
   else state.textContent = live ? "live" : `no new picture for ${Math.round(quiet / 1000)} s`;
 }
@@ -286,28 +288,7 @@ function turn() {
   requestAnimationFrame(turn);
 }
 
-/** Where the player is, and the event rate over the recording behind it. */
-function drawPlayer({ player, timeline }) {
-  if (!player) return;
-  at("play").textContent = player.ended ? "again" : player.paused ? "play" : "pause";
-  const lengthS = timeline ? timeline.column_s * timeline.counts.length : 0;
-  at("at").textContent = `${player.at_s.toFixed(2)}${timeline?.done ? ` of ${lengthS.toFixed(2)}` : ""} s`;
-  if (document.activeElement !== at("speed")) at("speed").value = player.speed ?? "";
-  if (!timeline) return;
-  const { context, width, height } = cleared(at("timeline"));
-  const most = Math.max(1, ...timeline.counts);
-  const column = width / timeline.counts.length;
-  context.fillStyle = colour("line");
-  timeline.counts.forEach((count, i) => {
-    const tall = (count / most) * (height - 4);
-    context.fillRect(i * column, height - tall, Math.max(column, 0.6), tall);
-  });
-  context.fillStyle = colour("accent");
-  context.fillRect((player.at_s / lengthS) * width - 1, 0, 2, height);
-}
-
 const stream = new Stream(document.body.dataset.port, document.body.dataset.token, listener);
-const lastOf = (channel) => model.cameras.get(model.camera)?.last[channel];
 at("camera").onchange = () => {
   model.camera = at("camera").value;
   forget();
@@ -316,38 +297,6 @@ at("time").onclick = () => {
   model.absolute = !model.absolute;
   dirty = true;
 };
-const toggle = () => {
-  const player = lastOf("player");
-  if (player?.ended) stream.ask("seek", { value: 0 });
-  else if (player) stream.ask("pause", { value: !player.paused });
-};
-at("play").onclick = toggle;
-at("step").onclick = () => stream.ask("step");
-at("speed").onchange = () => {
-  stream.ask("speed", { value: at("speed").value ? Number(at("speed").value) : null });
-  at("speed").blur();
-};
-function seek(toS) {
-  forget();
-  stream.ask("seek", { value: Math.max(0, toS) });
-}
-at("timeline").onclick = (event) => {
-  const timeline = lastOf("timeline");
-  if (timeline) seek((event.offsetX / at("timeline").clientWidth) * timeline.column_s * timeline.counts.length);
-};
-document.addEventListener("keydown", (event) => {
-  const player = lastOf("player");
-  if (!player || event.target.matches("select, input")) return;
-  const does = {
-    " ": toggle,
-    ".": () => stream.ask("step"),
-    ArrowLeft: () => seek(player.at_s - 1),
-    ArrowRight: () => seek(player.at_s + 1),
-  }[event.key];
-  if (!does || (event.key === " " && event.target.matches("button"))) return;
-  event.preventDefault();
-  does();
-});
 const redraw = () => {
   dirty = true;
 };

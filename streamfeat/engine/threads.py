@@ -1,0 +1,77 @@
+"""Threads that share the work of one large emission.
+
+Lives here: how many an engine uses, how many a piece of work is worth, and handing out its parts.
+Not here: what the work is (`kernels.update`, `kernels.planes`); threads that wait for files or for the
+network.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from streamfeat.errors import InputError
+from streamfeat.kernels.layout import Operator, State
+
+__all__ = ["MOST_THREADS", "Crew", "usable_threads"]
+
+MOST_THREADS = 256
+
+WORTH_A_PART = 1 << 19
+"""Filters times volumes that a part has at least: half a millisecond of work, against a tenth of one for
+handing it to another thread."""
+
+
+def usable_threads(threads: int | None = None) -> int:
+    """The number of threads that an engine shall use, checked.
+
+    Args:
+        threads: 1 to 256; None for one fewer than there are cores, and at least one.
+
+    Raises:
+        InputError: fewer or more than that.
+    """
+    if threads is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return min(max(cores - 1, 1), MOST_THREADS)
+    if not 1 <= threads <= MOST_THREADS:
+        raise InputError(f"{threads} threads: an engine uses 1 to {MOST_THREADS}")
+    return threads
+
+
+class Crew:
+    """The calling thread and some others; those start with the first large piece of work.
+
+    Args:
+        threads: how many, with the calling one.
+
+    Raises:
+        InputError: they are not 1 to 256.
+    """
+
+    def __init__(self, threads: int) -> None:
+        """Start nothing yet; the threads end with this object."""
+        self.threads = usable_threads(threads)
+        self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
+
+    def parts_for(self, work: int) -> int:
+        """In how many parts to do a piece of work, by its filters times volumes."""
+        return max(1, min(self.threads, work // WORTH_A_PART))
+
+    def share(
+        self,
+        kernel: Callable[[int, int, Operator, State], None],
+        parts: int,
+        operator: Operator,
+        state: State,
+    ) -> None:
+        """Call `kernel(part, parts, operator, state)` for each part, the first of them in this thread."""
+        others = [
+            self._others.submit(kernel, part, parts, operator, state)
+            for part in range(1, parts)
+            if self._others
+        ]
+        try:
+            kernel(0, parts, operator, state)
+        finally:  # none may still be at work on the state
+            for other in others:
+                other.result()
