@@ -836,32 +836,6 @@ GATHER_VOLUME = {
     "an end within a bin": lambda call: call.end % _line(call) > 0,
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
-LIST_FILLED = {
-    "as many as asked, and more are there": lambda call: (
-        call.result[0] == call.most and (call.result[1] < call.end)
-    ),
-    "all": lambda call: call.result[0] > 0 and call.result[1] == call.end,
-    "none": lambda call: call.result[0] == 0,
-    "from within a row": lambda call: call.start % call.patch > 0,
-    "the ring wraps": lambda call: call.first_slot > 0,
-    "without the newest bin": lambda call: call.end < len(call.entries),
-}
-LIST_CHANGED = {
-    "none": lambda call: call.result == 0,
-    "some": lambda call: call.result > 0,
-    "a slot that is not looked at, with a change": lambda call: (
-        (call.counts.clip(-call.limit, call.limit) != call.applied).any(axis=(1, 2)) & (call.slots == 0)
-    ).any(),
-    "beyond the limit": lambda call: (np.abs(call.counts) > call.limit).any(),
-    "an end within a row": lambda call: call.end % call.patch > 0,
-    "the ring wraps": lambda call: call.first_slot > 0,
-}
-ADD_COLUMNS = {
-    "none": lambda call: call.n == 0,
-    "fewer than four": lambda call: 0 < call.n < 4,
-    "fours alone": lambda call: call.n > 0 and call.n % 4 == 0,
-    "fours and a rest": lambda call: call.n > 4 and call.n % 4 > 0,
-}
 
 # Time surfaces.
 
@@ -916,7 +890,70 @@ ROWS = {
 
 NO_EVENT = {"no event": lambda call: len(call.events) == 0}
 
+
+def _coded(call):
+    return call.state.cursors[call.plane, CURSOR_CODED]
+
+
+FOLLOW_CHANGES = {
+    "its code moves": lambda call: (
+        not call.operator.inverse
+        and call.volume < _coded(call)
+        and call.state.moments[call.plane, call.volume, MOMENT_SQUARES] > 0
+    ),
+    "it was empty": lambda call: call.state.moments[call.plane, call.volume, MOMENT_SQUARES] == 0,
+    "it becomes empty": lambda call: (
+        call.n == np.count_nonzero(call.state.values[call.part, 0])
+        and call.n > 0
+        and (
+            call.state.values[call.part, 0, call.state.entries[call.part, : call.n]]
+            == -call.state.changes[call.part, : call.n]
+        ).all()
+    ),
+}
+
+LIST_MISSING = {
+    "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
+    "all are missing": lambda call: _current(call)[CURSOR_CODED] == 0,
+    "some are there": lambda call: 0 < _current(call)[CURSOR_CODED] < _n_volumes(call.state),
+    "every one, for the inverse": lambda call: call.operator.inverse,
+    "no event at all": lambda call: not call.state.applied.any(),
+}
+
+LIST_ENTRIES = {
+    "nothing": lambda call: call.start >= call.end,
+    "all are zero": lambda call: call.start < call.end and not call.values[call.start : call.end].any(),
+    "none is zero": lambda call: call.start < call.end and call.values[call.start : call.end].all(),
+    "entries before the first": lambda call: call.values[: call.start].any(),
+    "entries behind the last": lambda call: call.values[call.end :].any(),
+}
+
+TOUCHED_BINS = {
+    "nothing changed": lambda call: not call.state.touched_slots.any(),
+    "one bin of several": lambda call: np.count_nonzero(call.state.touched_slots) == 1 and _bins(call) > 1,
+    "all bins": lambda call: call.state.touched_slots.all(),
+}
+
+POOL_SOFT = {
+    "soft": lambda call: call.kind == SOFT,
+    "split": lambda call: call.kind == SPLIT,
+    "added": lambda call: call.sign > 0,
+    "taken": lambda call: call.sign < 0,
+}
+
+SUM_COLUMNS = {
+    "no column": lambda call: call.n == 0,
+    "an even number": lambda call: call.n > 0 and call.n % 2 == 0,
+    "an odd number": lambda call: call.n % 2 == 1,
+}
+
 CASES = {
+    "follow_changes": FOLLOW_CHANGES,
+    "list_missing": LIST_MISSING,
+    "list_entries": LIST_ENTRIES,
+    "touched_bins": TOUCHED_BINS,
+    "pool_soft": POOL_SOFT,
+    "sum_columns": SUM_COLUMNS,
     "decode_evt3": {"no word": lambda call: len(call.words) == 0},
     "decode_libcaer_cmp": LIBCAER_CMP,
     "decode_mono": MONO,
@@ -954,9 +991,6 @@ CASES = {
     "renew": RENEW,
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
-    "list_filled": LIST_FILLED,
-    "list_changed": LIST_CHANGED,
-    "add_columns": ADD_COLUMNS,
     "add_memory_surfaces": MEMORY_SURFACES,
     "time_surfaces": TIME_SURFACES,
 }

@@ -368,7 +368,10 @@ REFUSALS = {
     "truncated": (["info", "{bad}/cut"], "cut: "),
     "no mcap": (["info", "{bad}/text"], "not a known event file"),
     "no event topic": (["info", "{bad}/no_events"], "no topic carries"),
-    "two event topics": (["info", "{bad}/two_topics"], "/left, /right; choose one with --topic"),
+    "two event topics": (
+        ["replay", "{bad}/two_topics", "-m", "{home}/direct"],
+        "/left, /right; choose one with --topic",
+    ),
     "wrong topic": (["info", "{bad}/two_topics", "--topic", "/up"], "no events on topic /up;"),
     "packet length": (["info", "{bad}/bad_length"], "message 1"),
     "unknown encoding": (["info", "{bad}/unknown_encoding"], "morse"),

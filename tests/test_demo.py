@@ -63,17 +63,20 @@ def test_as_json_without_lines():
 def test_nothing_is_replaced_unasked_and_nothing_unsaid(tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
-    (folder / "model").write_bytes(b"mine")
+    (folder / "model.safetensors").write_bytes(b"mine")
     (folder / "notes").write_bytes(b"mine")
     result = run("--folder", "mine", "-q")
     assert isinstance(result.exception, cli.InputError)
-    assert str(result.exception) == "mine: holds model already; give --overwrite, or another --folder"
-    assert set(files(folder)) == {"model", "notes"}
+    assert (
+        str(result.exception)
+        == "mine: holds model.safetensors already; give --overwrite, or another --folder"
+    )
+    assert set(files(folder)) == {"model.safetensors", "notes"}
     result = run("--folder", "mine", "-q", "--overwrite")
     assert result.exit_code == 0
-    assert "replacing model in mine" in result.stderr
+    assert "replacing model.safetensors in mine" in result.stderr
     assert (folder / "notes").read_bytes() == b"mine"
-    assert (folder / "model").read_bytes() != b"mine"
+    assert (folder / "model.safetensors").read_bytes() != b"mine"
 
 
 def test_a_folder_that_cannot_be_made(tmp_path):

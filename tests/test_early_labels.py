@@ -9,8 +9,9 @@ from test_live_listen import message
 
 from streamfeat.live import intake as intake_module
 from streamfeat.live.inbox import Inbox, RawMessage
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
 from streamfeat.live.topic import MAX_TOPICS
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import EventPacket, LabelMessage
 from streamfeat.messages.packets import Label, Packet, Watermark
 

@@ -14,6 +14,7 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import with_fixed_point
+from streamfeat.engine.window import count_window
 from streamfeat.errors import InputError
 from streamfeat.files import safetensors_file as safe_arrays
 from streamfeat.kernels.layout import TRIANGLE
@@ -529,3 +530,13 @@ def test_what_no_json_can_hold_leaves_the_earlier_model(saved):
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
     target = tmp_path / "no" / "model.safetensors"
     assert "cannot write there" in refused(known_encoder().save, Path(target))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_counts_of_a_window_are_those_that_are_counted_one_by_one(seed):
+    """More events than a count holds, of either polarity, and events that are not of the window."""
+    geometry = Geometry(patch=2, stride=1, n_bins=3, bin_us=100, downsample=2, max_count=2)
+    events = random_events(np.random.default_rng(seed), geometry, (6, 8), 400)
+    counts = count_window(geometry, events, (6, 8), origin_us=-50, t_us=140)
+    np.testing.assert_array_equal(counts, naive.window_counts(events, geometry, (6, 8), -50, 140))
+    assert (counts.min(), counts.max()) == (-2, 2)

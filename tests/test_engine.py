@@ -533,6 +533,7 @@ def test_nothing_is_allocated_after_warm_up(kind):
 @pytest.mark.parametrize("kind", EXACT_KINDS, ids=ids)
 def test_any_number_of_threads_gives_what_one_gives(kind, look_ahead, monkeypatch):
     monkeypatch.setattr(threads, "WORTH_A_PART", 1)
+    monkeypatch.setattr(threads, "WORTH_COUNTING", 0)
     case = known_case(kind)
     events = some_events(case)
     one = case.engine(look_ahead=look_ahead)
@@ -570,7 +571,8 @@ def test_a_small_sensor_pays_nothing_for_threads(monkeypatch):
     engine.feed(some_events(case))
     assert engine.features().any()
     volumes = engine.grid_shape[0] * engine.grid_shape[1]
-    monkeypatch.setattr(threads, "WORTH_A_PART", 64 * volumes // 2)
+    monkeypatch.setattr(threads, "WORTH_A_PART", 64 * volumes // 4)
+    monkeypatch.setattr(threads, "WORTH_COUNTING", 64 * volumes)
     engine.restart(0)
     engine.feed(some_events(case))
     with pytest.raises(TypeError):

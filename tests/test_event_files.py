@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from streamfeat.camera_files.event_files import FORMATS, open_events, read_events
+from streamfeat.camera_files.prophesee import Unwrapped
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
 
@@ -399,3 +400,20 @@ def test_reading_twice_does_not_count_damage_twice(tmp_path):
         assert sum(map(len, file)) == 4
         assert file.lost_bytes == 3
         assert file.damage == [f"3 bytes at byte {len(dat_bytes(EVENTS))} are not a whole record"]
+
+
+def test_an_event_from_before_a_wrap_may_come_after_it_and_in_the_next_block():
+    turn = 1 << 32
+    unwrapped = Unwrapped(32)
+    assert unwrapped(np.array([turn - 10, 5, turn - 5, 7])).tolist() == [
+        turn - 10,
+        turn + 5,
+        turn - 5,
+        turn + 7,
+    ]
+    assert unwrapped(np.array([turn - 1, 8])).tolist() == [turn - 1, turn + 8]
+
+
+def test_nothing_is_from_before_the_first_turn_of_a_clock():
+    turn = 1 << 32
+    assert Unwrapped(32)(np.array([5, turn - 5, 7])).tolist() == [5, turn - 5, 7]

@@ -248,7 +248,7 @@ class TestWhatDoesNotFit:
         assert (done.labels, done.labels_left_out) == (0, 1)
 
     def test_an_unknown_ending_and_an_existing_file(self, source, tmp_path):
-        with pytest.raises(InputError, match=r"must end in \.mcap, \.raw"):
+        with pytest.raises(InputError, match=r"end in \.mcap, \.raw"):
             convert_recording(source, tmp_path / "out.avi")
         (tmp_path / "out.csv").write_text("precious")
         with pytest.raises(InputError, match="exists already"):

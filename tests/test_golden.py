@@ -15,7 +15,8 @@ from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
 from streamfeat.live.checkpoint import read_state
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.packets import Packet
 from streamfeat.stream.cameras import Cameras
 from streamfeat.stream.emission import EmitPolicy

@@ -170,11 +170,12 @@ def test_topics(capsys, monkeypatch):
         token = PlainNames("x").token("cam/a/events", bytes(16))
         with net.liveliness().declare_token(token):
             for more, expected in (
-                ([], "cam/a/events  zenoh, publishers: 1\n"),
+                ([], "cam/a/events  zenoh, publishers: 1, nothing was sent meanwhile\n"),
                 (
                     ["--json"],
                     '{"topics": [{"name": "cam/a/events", "kind": "zenoh", "domain": -1, '
-                    '"publishers": 1}]}\n',
+                    '"publishers": 1, "type": "", "encoding": "", "resolution": null, "rate_hz": 0.0, '
+                    '"bytes_per_s": 0.0}]}\n',
                 ),
             ):
                 words = ["streamfeat", "topics", "--port", str(port), *more]

@@ -97,7 +97,10 @@ def test_a_publisher_that_is_killed_and_another_in_its_place(files):
                     publisher.stdin.write(f"{message(events, i).hex()} {attachment(i + 1, gid).hex()}\n")
                 publisher.stdin.flush()
                 until(lambda life=life: job.result()["packets"] == 10 * (life + 1), lambda: f"{job.result()}")
-                until(lambda: job._intake.topics[KEY].stream_us == end, "the last packet's place in time")
+                until(
+                    lambda: job._intake.topics[KEY].timeline.reached_us == end,
+                    "the last packet's place in time",
+                )
                 publisher.kill()
         until(lambda: job._cameras.topics == [], "the second one's end")
     result = job.result()

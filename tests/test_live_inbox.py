@@ -60,6 +60,13 @@ def test_what_has_waited_too_long_is_dropped():
     assert taken[0].dropped == inbox.dropped == 7
 
 
+def test_long_names_take_their_room():
+    inbox = Inbox(max_bytes=50_000)
+    for _ in range(100):
+        inbox.put(raw("x" * 1024, size=0))
+    assert inbox.depth == 50_000 // 2048
+
+
 def test_a_message_larger_than_all_is_not_kept():
     inbox = Inbox(max_bytes=5000)
     inbox.put(raw(size=10_000))

@@ -1,6 +1,9 @@
 """ROS 2 without ROS: a plain zenoh session speaks what the design document of rmw_zenoh says, to the byte."""
 
 import struct
+import subprocess
+import sys
+import threading
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames, RosNames
 from streamfeat.live.network import FoundTopic, Network, find_topics
 from streamfeat.live.publish import PublishJob
+from streamfeat.live.survey import hear_topics
 from streamfeat.stream.outputs import Outputs
 
 pytestmark = pytest.mark.real_time
@@ -187,3 +191,117 @@ def test_topics_of_both_kinds_are_found():
             assert len(tokens) == 6
         # Whoever published them has left, and its tokens with it.
         until(lambda: find_topics(net, 0.05) == [])
+
+
+NO_HASH = "TypeHashNotSupported"
+"""What rmw_zenoh writes in ROS 2 Humble, which has no type hashes (ros2/rmw_zenoh, pull request 388)."""
+
+
+def test_a_camera_of_humble_is_heard(model):
+    port = free_port()
+    job = ListenJob(RosNames("/event_camera/events"), model, network=Network(port=port))
+    with plain_session(port, listen=True) as net:
+        token = net.liveliness().declare_token(TOKEN.replace(HASH, NO_HASH))
+        with running(job), net.declare_publisher(KEY.replace(HASH, NO_HASH)) as camera:
+            until(lambda: camera.matching_status.matching)
+            camera.put(cdr(tiny.steady(0, 1000, 10), 0, 0), attachment=attachment(1, 1))
+            until(lambda: job.result()["events"] == 10)
+            until(lambda: find_topics(net, 0.05) == [FoundTopic("/event_camera/events", "ros2", 0, 1)])
+        token.undeclare()
+
+
+@pytest.mark.parametrize(("has_hashes", "last"), [(True, HASH), (False, NO_HASH)])
+def test_publishing_to_each_distribution(tmp_path, has_hashes, last):
+    """A subscription of Humble has the key without a hash, to the letter."""
+    port = free_port()
+    recording = tiny.write_items(tmp_path / "r.mcap", [tiny.packet(tiny.steady(0, 1000, 10))])
+    names = RosNames("/event_camera/events", 0, has_hashes)
+    job = PublishJob(
+        [(recording, "/event_camera/events")], names, speed=None, network=Network(port=port), wait_s=30
+    )
+    with plain_session(port, listen=True) as net:
+        tokens = []
+        watch = net.liveliness().declare_subscriber("@ros2_lv/0/**", lambda s: tokens.append(str(s.key_expr)))
+        got = Collector(net, f"0/event_camera/events/{TYPE}/{last}")
+        job.run()
+        until(lambda: len(got.samples) == 1)
+        until(lambda: any(f"/{TYPE}/{last}/" in token for token in tokens))
+        watch.undeclare()
+
+
+def test_results_go_where_humble_listens(model):
+    port = free_port()
+    names = RosNames("/event_camera/events", 0, has_hashes=False)
+    job = ListenJob(names, model, emit="10ms", network=Network(port=port))
+    with plain_session(port, listen=True) as net:
+        out = Collector(net, f"0/event_camera/features/streamfeat_msgs::msg::dds_::Features_/{NO_HASH}")
+        with running(job), net.declare_publisher(KEY.replace(HASH, NO_HASH)) as camera:
+            until(lambda: camera.matching_status.matching)
+            camera.put(cdr(tiny.steady(0, 50_000, 100), 0, 0), attachment=attachment(1, 1))
+            until(lambda: out.samples)
+
+
+def test_what_topics_carry():
+    port = free_port()
+    plain = "robot/cam0/events"
+    with plain_session(port, listen=True) as net, plain_session(port) as other:
+        announced = TOKEN.replace(HASH, NO_HASH), PlainNames("x").token(plain, bytes(16))
+        tokens = [other.liveliness().declare_token(token) for token in announced]
+        found = until(lambda: len(topics := find_topics(net, 0.05)) == 2 and topics)
+        with running(_Sender(other, (KEY.replace(HASH, NO_HASH), plain))):
+            heard = until(lambda: all((h := hear_topics(net, found, 0.2))[i].rate_hz for i in (0, 1)) and h)
+    assert len(tokens) == 2
+    for topic in heard:
+        about = topic.type, topic.encoding, topic.resolution
+        assert about == ("event_camera_msgs/msg/EventPacket", "mono", (12, 16))
+        assert topic.bytes_per_s == pytest.approx(topic.rate_hz * len(cdr(tiny.steady(0, 1000, 10), 0, 0)))
+
+
+class _Sender:
+    """Puts a packet on each key, again and again, until it is stopped."""
+
+    def __init__(self, session, keys):
+        self._session, self._keys, self._is_on = session, keys, True
+
+    def run(self):
+        data = cdr(tiny.steady(0, 1000, 10), 0, 0)
+        while self._is_on:
+            for key in self._keys:
+                self._session.put(key, data)
+            threading.Event().wait(0.005)
+
+    def stop(self):
+        self._is_on = False
+
+
+MALFORMED = {
+    "a domain of 5,000 digits": TOKEN.replace("_lv/0/", f"_lv/{'7' * 5000}/"),
+    "a domain that is no number": TOKEN.replace("_lv/0/", "_lv/x/"),
+    "a topic without a name": TOKEN.replace("%event_camera%events", "%"),
+    "too few parts": "@ros2_lv/0/x/MP",
+    "wildcards in its name": TOKEN.replace("%event_camera%events", "%@x"),
+}
+
+
+def test_a_malformed_token_ends_nothing():
+    port = free_port()
+    newline = TOKEN.replace("%event_camera%events", "%event\ncamera%\x1b[31mevents")
+    with plain_session(port, listen=True) as net, plain_session(port) as other:
+        announced = *MALFORMED.values(), newline, TOKEN
+        tokens = [other.liveliness().declare_token(token) for token in announced]
+        found = until(lambda: len(topics := find_topics(net, 0.1)) >= 2 and topics)
+        names = [topic.name for topic in found]
+        assert "/event_camera/events" in names
+        assert "/event\ncamera/\x1b[31mevents" in names
+        assert {topic.domain for topic in found} == {0}
+        assert len(hear_topics(net, found, 0.01)) == len(found)
+        said = run_topics(port)
+    assert len(said.splitlines()) == len(found) < len(tokens)
+    assert "\x1b" not in said
+
+
+def run_topics(port):
+    words = [sys.executable, "-m", "streamfeat", "topics", "--port", str(port), "--seconds", "0.3"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stderr == ""
+    return done.stdout

@@ -12,6 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.messages import cdr
 from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 
 EVENTS = make_events([1, 500, 3], [7, 2, 400], [1, 0, 1], [2_000_001, 2_000_000, 3_999_999])
@@ -96,6 +97,34 @@ def test_any_damage_is_read_or_refused(message, data):
     raw[at : at + 4] = data.draw(st.binary(min_size=4, max_size=4))
     with contextlib.suppress(InputError):
         type(message).from_cdr(bytes(raw))
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None)
+def test_a_packet_read_at_once_is_that_which_is_read_field_by_field(data):
+    texts = st.text(max_size=9)
+    about = data.draw(st.integers(0, 2**60)), data.draw(texts), 260, 346, data.draw(st.integers(0, 2**64 - 1))
+    payload = data.draw(st.binary(max_size=20))
+    raw = bytearray(EventPacket(*about, 2**60, data.draw(texts), True, payload).to_cdr())
+    for _ in range(data.draw(st.integers(0, 2))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    raw = bytes(raw[: data.draw(st.integers(0, len(raw)))]) if data.draw(st.booleans()) else bytes(raw)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cdr, "_packet_fields", lambda raw: None)
+        slowly = read_or_refused(raw)
+    assert read_or_refused(raw) == slowly
+
+
+def read_or_refused(raw):
+    try:
+        return contents(EventPacket.from_cdr(raw))
+    except InputError as error:
+        return str(error)
+
+
+def test_sound_packets_are_read_at_once():
+    for message in MESSAGES[:2]:
+        assert cdr._packet_fields(message.to_cdr()) is not None
 
 
 def test_lying_length_names_field_and_byte():

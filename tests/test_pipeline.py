@@ -509,6 +509,20 @@ def test_replay_opens_all_outputs_or_leaves_none(tmp_path, digits):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "out.mcap.part"]
 
 
+def test_a_replay_inside_a_running_loop_is_one_clear_line_and_leaves_nothing(tmp_path, digits):
+    MODEL.save(tmp_path / "model")
+
+    async def inside():
+        job = ReplayJob(digits, tmp_path / "model")
+        with pytest.raises(InputError, match="an event loop is running here already"):
+            job.run(Outputs(json_lines=tmp_path / "out.jsonl"))
+        with pytest.raises(InputError, match=r"sf\.replay"):
+            run_until_interrupted([])
+
+    asyncio.run(inside())
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", "", "1e9"])
 def test_bad_speeds_are_refused(text):
     with pytest.raises(InputError, match="--speed"):

@@ -7,7 +7,7 @@ import pytest
 import tiny
 from rich.console import Console
 
-from streamfeat.demo.terminal import EventPicture, TerminalView
+from streamfeat.demo.terminal import EventPicture, TerminalView, draw_while
 from streamfeat.events import make_events
 from streamfeat.recordings.reader import Label
 from streamfeat.stream.emission import Emission
@@ -93,6 +93,18 @@ def test_sixty_columns_hold_picture_bars_and_counts(no_color):
     assert "━" in written
 
 
+def test_bars_have_one_scale_for_all_that_was_drawn():
+    console = terminal(color_system=None)
+    view = TerminalView(console, (34, 34), clock=lambda: 0.0)
+    lengths = []
+    for top in (4.0, 1.0, 8.0):
+        scores = np.array([0.0, top, top / 2], np.float32)
+        bars = view._bars(Emission(0, 0, np.zeros(4, np.float32), ("a", "b", "c"), scores, None, False))
+        lengths.append([len(bar.plain) for bar in bars.columns[1]._cells])
+    assert lengths == [[0, 16, 8], [0, 4, 2], [0, 16, 8]]
+    view.close(failed=False)
+
+
 def test_features_without_a_classifier_are_drawn_too():
     console = terminal()
     view = TerminalView(console, (34, 34))
@@ -100,6 +112,21 @@ def test_features_without_a_classifier_are_drawn_too():
     view.close(failed=False)
     console.file.seek(0)
     assert "7 events" in console.file.read()
+
+
+def test_events_are_drawn_until_something_else_is_done():
+    console, asked = terminal(), []
+
+    def goes_on():
+        asked.append(1)
+        return len(asked) < 4
+
+    packets = [tiny.packet(tiny.steady(i * 50_000, i * 50_000 + 50_000, 200)) for i in range(40)]
+    draw_while(goes_on, console, packets, tiny.RESOLUTION)
+    assert len(asked) == 4
+    console.file.seek(0)
+    assert "█" in console.file.read()
+    draw_while(lambda: True, console, packets[:1], tiny.RESOLUTION)
 
 
 def test_a_view_of_nothing_closes():

@@ -482,3 +482,51 @@ def test_strays_more_than_half_of_evt3s_range_ahead_are_no_wrap(tmp_path, ahead_
     n = strays.stop - strays.start
     assert (counts.pop("stray packets", 0), counts.pop("stray events", 0)) == ((1, 0) if n == 200 else (0, n))
     assert counts == {}
+
+
+class TestInfoOfSeveral:
+    def test_recordings_are_rows_of_a_table_and_what_cannot_be_read_a_line(self, run, tmp_path):
+        good = [store(tmp_path / f"{n}.mcap", messages(moving_dot(n, 0))) for n in (400, 600)]
+        (tmp_path / "bad.mcap").write_bytes(b"")
+        said = run("info", *good, tmp_path / "bad.mcap")
+        assert said.status == 1
+        rows = [line.split() for line in said.out.splitlines()]
+        assert [row[0] for row in rows] == ["file", "400.mcap", "600.mcap"]
+        assert [row[4] for row in rows[1:]] == ["400", "600"]
+        assert "bad.mcap: is empty" in said.err
+        data = run("info", *good, "--json").json["recordings"]
+        assert [row["events"] for row in data] == [400, 600]
+        assert data[0]["digest"] == run("info", good[0], "--json").json["digest"]
+
+    def test_two_cameras_are_two_rows(self, run, tmp_path):
+        path = tmp_path / "two.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start("ros2")
+            for topic, n in (("/left", 400), ("/right", 600)):
+                schema = writer.register_schema(EventPacket.SCHEMA_NAME, "ros2msg", b"")
+                channel = writer.register_channel(topic, "cdr", schema)
+                for m in messages(moving_dot(n, 0)):
+                    writer.add_message(channel, m.log_ns, m.data, m.log_ns, m.seq)
+            writer.finish()
+        said = run("info", path, "--json")
+        assert [(row["topic"], row["events"]) for row in said.json["recordings"]] == [
+            ("/left", 400),
+            ("/right", 600),
+        ]
+        assert run("info", path, "--topic", "/right", "--json").json["events"] == 600
+        refused = run("latency", path, "-m", "none")
+        assert refused.status == 2
+        listed = run("info", path).out.splitlines()
+        assert [line.split()[:2] for line in listed[1:]] == [["two.mcap", "/left"], ["two.mcap", "/right"]]
+
+    @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+    def test_a_file_cut_in_its_only_chunk_says_at_which_byte(self, run, tmp_path, compression):
+        path = store(
+            tmp_path / "a.mcap", messages(moving_dot(4000, 0)), chunk_size=1 << 20, compression=compression
+        )
+        path.write_bytes(path.read_bytes()[:5000])
+        said = run("info", path)
+        assert said.status == 2
+        assert "no topic carries events" in said.err
+        assert "the file ends at byte 5000" in said.err

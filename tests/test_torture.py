@@ -4,7 +4,7 @@ import json
 
 import pytest
 from torture import __main__ as torture
-from torture import kills, soak
+from torture import crowd, kills, soak
 from torture.nursery import Nursery
 from torture.table import Row, Trials, markdown
 
@@ -26,6 +26,13 @@ def test_commands_that_are_killed(trials, monkeypatch):
     with Nursery(kills.ROOT) as nursery:
         commands = [make(nursery, trials) for make in (kills._convert, kills._evaluate)]
         survived([kills._try(nursery, trials, command) for command in commands])
+
+
+def test_a_short_crowd(trials, monkeypatch):
+    monkeypatch.setattr(crowd, "_GROWTH", 256 << 20)
+    rows = crowd.crowd(trials)
+    survived(rows)
+    assert [row.tried for row in rows] == [10_000, 10_000, 400]
 
 
 def test_a_short_soak(trials, monkeypatch):

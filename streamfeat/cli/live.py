@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from streamfeat.cli.program import (
     AnyLocation,
@@ -60,6 +61,14 @@ RosOption = Annotated[
     str | None, typer.Option("--ros2", metavar="TOPIC", help="ROS 2 topic (rmw_zenoh) instead of a key.")
 ]
 DomainOption = Annotated[int, typer.Option(help="ROS_DOMAIN_ID, with --ros2.")]
+DistroOption = Annotated[
+    str,
+    typer.Option(
+        "--ros2-distro",
+        help="ROS 2 of those that hear what is published: humble has no type hashes in its keys.",
+        autocompletion=completing("humble", "jazzy", "rolling"),
+    ),
+]
 ReliableOption = Annotated[
     bool, typer.Option("--reliable", help="Recover missed packets; both ends must ask for it.")
 ]
@@ -70,13 +79,26 @@ ConfigOption = Annotated[
 PortOption = Annotated[int, typer.Option(help="Loopback port where sessions meet; without --zenoh-config.")]
 
 
-def names_of(key: str | None, ros2: str | None, domain: int) -> "Names":
+def has_hashes(distro: str) -> bool:
+    """Whether keys of a distribution of ROS 2 have type hashes.
+
+    Raises:
+        InputError: it is unknown.
+    """
+    from streamfeat.live.names import ROS_DISTROS
+
+    if distro.lower() not in ROS_DISTROS:
+        raise InputError(f"--ros2-distro {distro} is unknown; known are {', '.join(ROS_DISTROS)}")
+    return ROS_DISTROS[distro.lower()]
+
+
+def names_of(key: str | None, ros2: str | None, domain: int, distro: str = "jazzy") -> "Names":
     from streamfeat.live.names import PlainNames, RosNames
 
     if (key is None) == (ros2 is None):
         raise InputError("give a zenoh key expression, or a ROS 2 topic with --ros2")
     if ros2 is not None:
-        return RosNames(ros2, domain)
+        return RosNames(ros2, domain, has_hashes(distro))
     return PlainNames(str(key))
 
 
@@ -111,6 +133,7 @@ def listen(
     isolated: Isolated = None,
     ros2: RosOption = None,
     domain: DomainOption = 0,
+    ros2_distro: DistroOption = "jazzy",
     reliable: ReliableOption = False,
     max_delay: Annotated[
         float, typer.Option(help="Seconds that packets may wait before the oldest are dropped.")
@@ -155,7 +178,7 @@ def listen(
     for path in (output, json_lines, table):
         if path and str(path) != "-":
             refuse_existing(path, model, classifier, state, overwrite=overwrite)
-    names = names_of(key, ros2, domain)
+    names = names_of(key, ros2, domain, ros2_distro)
     chosen = model_or_general(model)
     common: dict[str, Any] = {
         "emit": emit,
@@ -237,6 +260,7 @@ def publish(
     wait: Annotated[float, typer.Option(help="Seconds to wait for a subscriber.")] = 1.0,
     ros2: Annotated[bool, typer.Option("--ros2", help="Keys are ROS 2 topics (rmw_zenoh).")] = False,
     domain: DomainOption = 0,
+    ros2_distro: DistroOption = "jazzy",
     reliable: ReliableOption = False,
     zenoh_config: ConfigOption = None,
     port: PortOption = 7447,
@@ -253,7 +277,7 @@ def publish(
         raise InputError("give each recording a key: publish ONE.mcap cam0/events TWO.mcap cam1/events")
     pairs = [(location_of(path), key) for path, key in zip(sources[::2], sources[1::2], strict=True)]
     for _, key in pairs:
-        names = RosNames(key, domain) if ros2 else PlainNames(key)
+        names = RosNames(key, domain, has_hashes(ros2_distro)) if ros2 else PlainNames(key)
     job = PublishJob(
         pairs,
         names,
@@ -336,20 +360,34 @@ def topics(
     port: PortOption = 7447,
     as_json: JsonOption = False,
 ) -> None:
-    """Topics that events are published on, plain zenoh and ROS 2."""
+    """Topics that events are published on, plain zenoh and ROS 2, and what they carry.
+
+    Publishers are looked for, and then listened to for as long: type, encoding, resolution and rate.
+    """
     from dataclasses import asdict
 
+    from streamfeat.errors import printable
     from streamfeat.live.network import Network, find_topics
+    from streamfeat.live.survey import hear_topics
 
     if not 0 <= seconds < 1e6:
         raise InputError(f"--seconds {seconds}: give a number from 0 on")
     with Network(zenoh_config, port).open() as session:
         found = find_topics(session, seconds)
+        heard = hear_topics(session, found, seconds if found else 0)
     if as_json:
-        print_json("topics", {"topics": [asdict(topic) for topic in found]})
+        rows = [asdict(topic.found) | asdict(topic) for topic in heard]
+        for row in rows:
+            del row["found"]
+        print_json("topics", {"topics": rows})
         return
-    for topic in found:
-        where = f"ROS 2, domain {topic.domain}" if topic.kind == "ros2" else "zenoh"
-        out.print(f"{topic.name}  [dim]{where}, publishers: {topic.publishers}[/]", soft_wrap=True)
-    if not found:
+    for topic in heard:
+        about = topic.found
+        where = f"ROS 2, domain {about.domain}" if about.kind == "ros2" else "zenoh"
+        size = f"{topic.resolution[1]}x{topic.resolution[0]}" if topic.resolution else ""
+        rate = f"{topic.rate_hz:,.1f} messages/s, {topic.bytes_per_s / 1e6:,.2f} MB/s"
+        carried = (topic.type, topic.encoding, size, rate) if topic.type else ("nothing was sent meanwhile",)
+        parts = where, f"publishers: {about.publishers}", *map(printable, filter(None, carried))
+        out.print(f"{escape(printable(about.name))}  [dim]{escape(', '.join(parts))}[/]", soft_wrap=True)
+    if not heard:
         out.print("no topic with events was found")

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
+from streamfeat.cli.overview import has_several, print_overview
 from streamfeat.cli.program import (
     AnyLocation,
     ClusterOption,
     JsonOption,
     OverwriteOption,
     QuietOption,
-    RecordingArgument,
+    RecordingsArgument,
     TopicOption,
     WorkersOption,
     app,
@@ -40,15 +41,22 @@ _FAULTS_SHOWN = 20
 @app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
 @reads_recordings()
 def info(
-    recording: RecordingArgument,
+    recordings: RecordingsArgument,
     reading: "ReadOptions",
     topic: TopicOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording."""
+    """Topics, encoding, resolution, events, duration, rate, labels and integrity of a recording.
+
+    Of several recordings, or of one with several cameras, a table with a row for each camera.
+    """
     from streamfeat.messages.timeline import TIMELINE_COUNTS
     from streamfeat.recordings.reader import open_recording
 
+    if has_several(recordings, topic, reading):
+        print_overview(recordings, topic, reading, as_json=as_json)
+        return
+    recording = recordings[0]
     with open_recording(recording, topic, reading) as rec:
         print_assumptions(rec.assumptions)
         with progress_bars() as report:

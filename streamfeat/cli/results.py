@@ -103,6 +103,13 @@ RESULTS: dict[str, dict[str, Field]] = {
         "integrity": Field("text", "`intact` or `damaged`"),
         "removed": _REMOVED,
     },
+    "info REC REC": {
+        "recordings": Field(
+            "[object]",
+            "of each camera: `file`, `topic`, `encoding`, `resolution`, `events`, `duration_s`, `samples`, "
+            "`digest`, `integrity`; or `file` and `error`",
+        ),
+    },
     "convert": {
         "written": _WRITTEN,
         "samples": Field("int?", "samples of a data set folder"),
@@ -248,7 +255,11 @@ RESULTS: dict[str, dict[str, Field]] = {
         "reasons": Field("{int}", "the same by reason"),
     },
     "topics": {
-        "topics": Field("[object]", "what is known of each topic"),
+        "topics": Field(
+            "[object]",
+            "of each topic `name`, `kind` (`zenoh`, `ros2`), `domain`, `publishers`, `type`, `encoding`, "
+            "`resolution` (null where nothing was sent), `rate_hz`, `bytes_per_s`",
+        ),
     },
     "demo": {
         "written": Field("text", "the folder that was written to"),

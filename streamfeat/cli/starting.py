@@ -57,7 +57,7 @@ def demo(
             with job.compiling():
                 simulated = job.simulate()
                 encoder = job.learn()
-                job.compile(encoder)
+                job.compile(encoder, None if quiet else err)
             classifier = job.fit(encoder)
         replayed = job.replay(encoder, classifier, None if quiet or as_json else out)
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import encode_samples
-from streamfeat.demo.terminal import EventPicture, TerminalView
+from streamfeat.demo.terminal import EventPicture, TerminalView, draw_while
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.random_encoder import random_encoder
@@ -39,7 +39,7 @@ from streamfeat.stream.warming import warm_up
 
 __all__ = ["FILES", "Demo"]
 
-FILES = ("train.mcap", "test.mcap", "model", "classifier")
+FILES = ("train.mcap", "test.mcap", "model.safetensors", "classifier.safetensors")
 """Files that the demonstration writes."""
 
 SIZES = {"train": 200, "test": 40}
@@ -114,11 +114,20 @@ class Demo:
         encoder.save(self.model)
         return encoder
 
-    def compile(self, encoder: Encoder) -> None:
-        """Compile what encoding and replaying would otherwise wait for, without a word, when first needed."""
+    def compile(self, encoder: Encoder, console: Console | None = None) -> None:
+        """Compile what encoding and replaying would otherwise wait for, without a word, when first needed.
+
+        Args:
+            encoder: that was learned.
+            console: a terminal that the camera's picture is drawn on meanwhile, if it has room.
+        """
         remark = "kernels, kept for the next time"
         self._report("compiling", 0, 2, remark)
         if self._compiler:
+            if console and TerminalView.fits(console):
+                with open_recording(self.test) as recording:
+                    items = recording.played(loop=True)
+                    draw_while(self._compiler.is_alive, console, items, recording.resolution)
             self._compiler.join()
         self._report("compiling", 1, 2, remark)
         _use_kernels(encoder)

@@ -6,22 +6,24 @@ Not here: where the events come from (`demo`), and lines of text (`sinks`).
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from threading import Event
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.color import Color
 from rich.console import Console, RenderableType
 from rich.live import Live
-from rich.progress_bar import ProgressBar
 from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from streamfeat.events import Events, Resolution
+from streamfeat.messages.packets import Label, Packet
 from streamfeat.stream.emission import Emission
+from streamfeat.stream.pacing import groups_of, stream_time
 
-__all__ = ["EventPicture", "TerminalView"]
+__all__ = ["EventPicture", "TerminalView", "draw_while"]
 
 _ON, _OFF = np.array([255.0, 196.0, 60.0]), np.array([70.0, 150.0, 255.0])
 _HALF_LIFE_US = 20_000.0
@@ -75,6 +77,36 @@ class EventPicture:
         )
 
 
+def draw_while(
+    goes_on: Callable[[], bool], console: Console, items: Iterable[Packet | Label], resolution: Resolution
+) -> None:
+    """Draw the events of a recording at their own pace, until they end or something else is done.
+
+    Args:
+        goes_on: asked before each picture.
+        console: a terminal, see `TerminalView.fits`; the picture is gone at the end.
+        items: of the recording.
+        resolution: `(height, width)` of the sensor.
+    """
+    picture, pause = EventPicture(resolution, _PICTURE), Event()
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        due_us: int | None = None
+        for group in groups_of(items, 1.0):
+            now_us = stream_time(group.items)
+            if now_us is None:
+                continue
+            for item in group.items:
+                if isinstance(item, Packet):
+                    picture.add(item.events)
+            due_us = now_us if due_us is None else due_us
+            while due_us <= now_us:
+                if not goes_on():
+                    return
+                live.update(picture.draw(due_us), refresh=True)
+                due_us += round(1e6 / _PICTURES_A_SECOND)
+                pause.wait(1 / _PICTURES_A_SECOND)
+
+
 def _line(upper: NDArray[np.float64], lower: NDArray[np.float64]) -> Text:
     line = Text(no_wrap=True)
     for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
@@ -115,6 +147,7 @@ class TerminalView:
         self._clock = clock
         self._next = 0.0
         self._latest: Emission | None = None
+        self._widest = 1e-9
         self._samples = 0
         self._correct = 0
 
@@ -143,7 +176,7 @@ class TerminalView:
     def _draw(self, e: Emission) -> None:
         side = Table.grid()
         side.add_row(Text(f"{e.t_us / 1e6:.1f} s, {e.n_events:,} events", style="dim"))
-        side.add_row(_bars(e) if e.labels else "")
+        side.add_row(self._bars(e) if e.labels else "")
         shown = f"this is a {e.sample.label}" if e.sample else ""
         side.add_row(Text(shown))
         if self._samples:
@@ -155,16 +188,17 @@ class TerminalView:
         grid.add_row(self.picture.draw(e.t_us), side)
         self._live.update(grid, refresh=True)
 
+    def _bars(self, e: Emission) -> RenderableType:
+        """A bar for each label, as long as its score is above the lowest; the prediction is bold.
 
-def _bars(e: Emission) -> RenderableType:
-    """A bar for each label, as long as its score is above the lowest; the prediction is bold."""
-    table = Table.grid(padding=(0, 1))
-    scores = e.scores - e.scores.min()
-    longest = max(float(scores.max()), 1e-9)
-    right = {True: "green", False: "red", None: "cyan"}[e.correct]
-    for label, score in zip(e.labels, scores.tolist(), strict=True):
-        is_first = label == e.prediction
-        style = right if is_first else "grey50"
-        bar = ProgressBar(longest, score, _BAR, complete_style=style, finished_style=style)
-        table.add_row(Text(label, style="bold" if is_first else "dim"), bar)
-    return table
+        One scale for all that was drawn: the widest spread of scores so far fills a bar.
+        """
+        table = Table.grid(padding=(0, 1))
+        scores = e.scores - e.scores.min()
+        self._widest = max(self._widest, float(scores.max()))
+        right = {True: "green", False: "red", None: "cyan"}[e.correct]
+        for label, score in zip(e.labels, scores.tolist(), strict=True):
+            is_first = label == e.prediction
+            bar = Text("━" * round(_BAR * score / self._widest), style=right if is_first else "grey50")
+            table.add_row(Text(label, style="bold" if is_first else "dim"), bar)
+        return table

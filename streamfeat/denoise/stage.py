@@ -15,9 +15,8 @@ from typing import Self, TypeVar
 import numpy as np
 
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution
+from streamfeat.events import TIME_LIMIT, Events, Resolution
 from streamfeat.kernels.denoise import HOT, HOT_LEVEL, ISOLATED, REFRACTORY, mark_noise
-from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.messages.packets import Label, Packet, Watermark
 
 __all__ = ["Denoiser", "Denoising", "parse_duration"]
@@ -120,7 +119,7 @@ class Denoiser:
 
     def restart(self) -> None:
         """Forget the past, not the counts."""
-        self._past.fill(BEFORE_TIME)
+        self._past.fill(-TIME_LIMIT)
         self._level.fill(0)
 
     def events(self, events: Events, resolution: Resolution) -> Events:

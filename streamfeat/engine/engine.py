@@ -175,7 +175,7 @@ class Engine(Shown):
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
         filters = operator.offset.shape[0]
-        if crew.parts_for(self._most_volumes * filters) == 1:
+        if not crew.is_worth_counting(self._most_volumes * filters):
             update(operator, state)
             return
         mark_dirty(operator, state)

@@ -16,9 +16,12 @@ __all__ = ["MOST_THREADS", "Crew", "usable_threads"]
 
 MOST_THREADS = 256
 
-WORTH_A_PART = 1 << 19
-"""Filters times volumes that a part has at least: half a millisecond of work, against a tenth of one for
-handing it to another thread."""
+WORTH_A_PART = 1 << 18
+"""Filters times volumes that a part has at least: a third of a millisecond of work, against a tenth of one
+for handing it to another thread."""
+
+WORTH_COUNTING = 1 << 20
+"""Filters times volumes that there may be before an update is done in several steps, to find out how many."""
 
 
 def usable_threads(threads: int | None = None) -> int:
@@ -54,8 +57,12 @@ class Crew:
         self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
 
     def parts_for(self, work: int) -> int:
-        """In how many parts to do a piece of work, by its filters times volumes."""
+        """In how many parts to do a piece of work, given its filters times volumes."""
         return max(1, min(self.threads, work // WORTH_A_PART))
+
+    def is_worth_counting(self, most: int) -> bool:
+        """Whether to find out how much work there is, given a bound of its filters times volumes."""
+        return self.threads > 1 and most >= WORTH_COUNTING
 
     def share(
         self,

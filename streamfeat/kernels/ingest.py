@@ -27,6 +27,10 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
+from streamfeat.kernels.vectors import prefetch
+
+SOON = 16
+"""Pixels of events lie anywhere in a ring that caches may not hold: loaded this many events ahead."""
 
 UNCHANGED = -1
 """Instead of the position of a bin: no clipped count changed."""
@@ -140,6 +144,11 @@ def count_events(events: Events, operator: Operator, state: State) -> None:
     start, first = start_of_bin(state), clock[CLOCK_SLOT] * slot_length
     n_touched, n_saturated = clock[CLOCK_TOUCHED], 0
     for i in range(events.shape[0]):
+        event = events[min(i + SOON, events.shape[0] - 1)]
+        x, y = min(int(event.x), columns.shape[0] - 1), min(int(event.y), rows.shape[0] - 1)
+        later = first + np.int64(rows[y]) * row_length + columns[x]
+        prefetch(counts, later)
+        prefetch(flags, later)
         event = events[i]
         x, y, p, t = event.x, event.y, event.p, event.t
         if is_valid(x, y, p, t, state) and np.uint64(t - start) < np.uint64(operator.bin_us):

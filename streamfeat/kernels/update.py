@@ -26,7 +26,15 @@ from streamfeat.kernels.layout import (
     State,
 )
 from streamfeat.kernels.planes import ALONE, FIRST, fill_plane, share_of
+from streamfeat.kernels.vectors import prefetch
 from streamfeat.kernels.volume import gather_volume, list_entries
+
+SOON = 16
+"""Touched entries lie anywhere in a ring that caches may not hold: loaded this many ahead of their turn."""
+
+
+LINE = 16
+"""Numbers of a projection that a line of the cache holds."""
 
 
 @kernel
@@ -42,8 +50,12 @@ def mark_dirty(operator: Operator, state: State) -> None:
     n_volumes, patch, columns = operator.shape[0] * operator.shape[1], operator.patch, operator.shape[1]
     news, is_dirty, stride = state.news.reshape(-1), state.is_dirty, operator.stride
     state.touched_slots[:] = 0
-    for i in range(state.clock[CLOCK_TOUCHED]):
-        place = state.touched[i]
+    n_touched = state.clock[CLOCK_TOUCHED]
+    for i in range(n_touched):
+        place, later = state.touched[i], np.int64(state.touched[min(i + SOON, n_touched - 1)])
+        prefetch(counts, later)
+        prefetch(applied, later)
+        prefetch(news, later)
         change = min(max(np.int64(counts[place]), -limit), limit) - applied[place]
         if change == 0:
             continue
@@ -100,7 +112,11 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
     values, news, n_volumes = state.values[part, 0], state.values[part, 1], operator.shape[0] * columns
     first_bin, last_bin = touched_bins(state)
     first, last = share_of(part, parts, state)
+    rows, width = state.projections.reshape(-1), state.projections.shape[2]
     for i in range(first, last):
+        following = np.int64(state.dirty[min(i + 1, last - 1)]) * width
+        for k in range(following, following + width, LINE):
+            prefetch(rows, k)
         plane, volume = np.int64(state.dirty[i]) // n_volumes, np.int64(state.dirty[i]) % n_volumes
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
         end = (n_bins - ahead) * patch * patch

@@ -16,7 +16,7 @@ from numba.core import cgutils
 
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "sum_pairs"]
+__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_pairs"]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
@@ -84,6 +84,23 @@ def lowest_bit(typing: Any, mask: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(_I1, 1))
 
     return types.int64(types.uint64), generate
+
+
+@generated
+def prefetch(typing: Any, array: Any, index: Any) -> Any:
+    """Begin to load an element that is needed soon; what it holds, and whether it exists, does not matter."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.bitcast(builder.gep(array.data, [arguments[1]]), ir.IntType(8).as_pointer())
+        function = builder.module.declare_intrinsic(
+            "llvm.prefetch", [place.type], ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
+        )
+        read, near, data = (ir.Constant(_I32, value) for value in (0, 3, 1))
+        builder.call(function, [place, read, near, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
 
 
 @generated

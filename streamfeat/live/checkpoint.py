@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
+from streamfeat.events import TIME_LIMIT
 from streamfeat.files.atomic import sweep
 from streamfeat.files.json_fields import Fields
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
-from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.live.health import Health
 from streamfeat.live.intake import Intake
 from streamfeat.live.shard import Shard
@@ -222,8 +222,8 @@ def _session(values: Fields, arrays: Mapping[str, NDArray[Any]], i: int, fingerp
             fingerprint=fingerprint,
             counts=arrays[f"{i}.counts"],
             atoms=arrays[f"{i}.atoms"],
-            bin=inner.whole("bin", BEFORE_TIME),
-            origin_us=inner.whole("origin_us", BEFORE_TIME),
+            bin=inner.whole("bin", -TIME_LIMIT),
+            origin_us=inner.whole("origin_us", -TIME_LIMIT),
             tally=arrays[f"{i}.tally"],
             encoded=arrays[f"{i}.encoded"],
         )

@@ -17,7 +17,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from streamfeat.errors import InputError
 from streamfeat.latency.histogram import RecentLatencies
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.delivery import DeliveryStats
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission
@@ -28,6 +29,14 @@ __all__ = ["CameraFigures", "Health", "parse_address"]
 
 _BUCKETS = tuple(scale * base for scale in (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0) for base in (1, 2, 5))
 _PERCENTILES = 50, 99
+_TIMES = {
+    "restarts": ("clock_restarts", "Cameras' clocks that started anew"),
+    "jumps": ("clock_jumps", "Cameras' clocks that jumped ahead by more than a minute"),
+    "wraps": ("clock_wraps", "Cameras' clocks that wrapped, which is undone"),
+    "stray packets": ("stray_packets", "Packets with absurd times, which were left out"),
+    "stray events": ("stray_events", "Events with absurd times, which were left out"),
+}
+"""Names and meanings of what timelines count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +164,14 @@ class Health:
             ("reordered_packets", delivery.reordered, "Packets that arrived late"),
             ("foreign_packets", delivery.foreign, "Packets of a second publisher on the same key"),
             ("publisher_restarts", delivery.restarts, "Publishers that took over or began to count anew"),
+            *self._times(),
             *self._left(),
         ]
+
+    def _times(self) -> list[tuple[str, int, str]]:
+        """What happened to the clocks of cameras, and to packets because of their times."""
+        counts = self._intake.counts()
+        return [(name, counts[of], text) for of, (name, text) in _TIMES.items()]
 
     def _left(self) -> list[tuple[str, int, str]]:
         """Packets of other shards: a sign of life for a shard without cameras; only with `--shard`."""
@@ -234,7 +249,8 @@ class Health:
         if stats.correct is not None and stats.samples:
             result["correct"] = stats.correct
             result["accuracy"] = round(stats.correct / stats.samples, 4)
-        result |= self.drops() | {"warnings": dict(sorted(self.reasons().items()))}
+        result |= self.drops() | {name: value for name, value, _ in self._times()}
+        result |= {"warnings": dict(sorted(self.reasons().items()))}
         result |= {name: left for name, left, _ in self._left()}
         for name, seconds in self._recent_end_to_end.percentiles(*_PERCENTILES):
             result[f"end_to_end_{name}_ms"] = round(1e3 * seconds, 3)

@@ -17,7 +17,8 @@ __all__ = ["Announcement", "Inbox", "RawMessage"]
 
 _MAX_BYTES = 64 << 20
 _OVERHEAD = 512
-"""What a message costs besides its payload, so that their number is bounded too: 131,072 empty ones."""
+"""What a message costs besides its payload, so that their number is bounded too: 131,072 empty ones; with a
+name of more than 256 characters it costs more."""
 _TAKEN_AT_ONCE = 64
 _MAX_ANNOUNCEMENTS = 4096
 """Announcements that may wait; further ones are refused and counted."""
@@ -100,7 +101,7 @@ class Inbox:
                 self._announcements += 1
             self._items.append(item)
             if isinstance(item, RawMessage):
-                self._bytes += len(item.payload) + _OVERHEAD
+                self._bytes += _cost(item)
                 self._drop_oldest(item.arrived_ns - self._max_delay_ns)
             self._changed.notify()
 
@@ -119,7 +120,7 @@ class Inbox:
         while self._items and (self._bytes > self._max_bytes or self._arrived_ns(self._items[0]) < limit_ns):
             oldest = self._items.popleft()
             if isinstance(oldest, RawMessage):
-                self._bytes -= len(oldest.payload) + _OVERHEAD
+                self._bytes -= _cost(oldest)
                 if oldest.topic in self._dropped or len(self._dropped) < _MAX_NAMED:
                     self._dropped[oldest.topic] += 1
                 self.dropped += 1
@@ -147,7 +148,7 @@ class Inbox:
             taken = [self._items.popleft() for _ in range(min(len(self._items), _TAKEN_AT_ONCE))]
             for item in taken:
                 if isinstance(item, RawMessage):
-                    self._bytes -= len(item.payload) + _OVERHEAD
+                    self._bytes -= _cost(item)
                     item.dropped = self._dropped.pop(item.topic, 0)
                 elif isinstance(item, Announcement):
                     self._announcements -= 1
@@ -158,3 +159,7 @@ class Inbox:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+
+def _cost(message: RawMessage) -> int:
+    return len(message.payload) + max(_OVERHEAD, 2 * len(message.topic))

@@ -1,7 +1,9 @@
-"""From messages as they came to items of the stream: checked, counted, placed in time.
+"""From messages as they came to items of the stream: checked, counted, and in silence given time.
 
-Lives here: what is refused and why, warnings, who appears and who leaves, and time that passes in silence.
-Not here: the network (`network`), what is done with events (`cameras`).
+Lives here: which messages are refused and why, warnings, cameras that appear and leave, and time that passes
+in silence.
+Not here: the network (`network`), numbers and times of packets, for which recordings have the same rule
+(`messages.timeline`), what is done with events (`cameras`).
 
 Whatever arrives is hostile until proven otherwise. A payload may have 4 MiB and 2^20 events, a sensor 2^22
 pixels, and no more than 256 topics are followed at a time, so that memory is bounded by those numbers and by
@@ -11,82 +13,51 @@ the inbox. What is refused is counted under its reason, with one line a second a
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, Self
-
-import numpy as np
-from rich.console import Console
+from typing import Any
 
 from streamfeat.errors import InputError
 from streamfeat.files.json_fields import Fields
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.names import Attachment
-from streamfeat.live.topic import (
-    MAX_LABEL_US,
-    MAX_LIVE_PACKET_EVENTS,
-    MAX_STREAM_US,
-    MAX_TOPICS,
-    Barrier,
-    TopicState,
-)
-from streamfeat.messages.cdr import EventPacket, LabelMessage
-from streamfeat.messages.clock import CameraClock
-from streamfeat.messages.delivery import DeliveryStats
-from streamfeat.messages.packets import EVENT_SCHEMAS, MAX_PIXELS, Label, Packet, PacketReader, Watermark
-from streamfeat.stream.cameras import CameraLeft
+from streamfeat.live.names import Attachment, beside
+from streamfeat.live.refusals import RefusalError, checked_label, parsed
+from streamfeat.live.topic import MAX_LIVE_PACKET_EVENTS, MAX_TOPICS, Barrier, TopicState
+from streamfeat.live.warnings import Warnings
+from streamfeat.messages.cdr import LabelMessage
+from streamfeat.messages.delivery import DeliveryStats, Verdict
+from streamfeat.messages.event_messages import EVENT_SCHEMAS
+from streamfeat.messages.packets import Label, Packet, Watermark
+from streamfeat.messages.timeline import HOLD_NS, Timeline
+from streamfeat.stream.cameras import MAX_CAMERAS, CameraLeft
 
-__all__ = ["MAX_PAYLOAD_BYTES", "Intake", "Warnings"]
+__all__ = ["Intake"]
 
-MAX_PAYLOAD_BYTES = 4 << 20
 _MAX_SPAN_US = 60_000_000
+"""A label further than this from its stream is refused."""
+_AHEAD_US = 1_000_000
+"""Of a label further ahead than this there is a warning: events before it are late."""
 _POLL_S = 0.02
 _IDLE_S = 0.25
 _FORGOTTEN_NS = 60_000_000_000
+"""A camera that has been silent for so long gives its place to a new one, where there is no other."""
 SILENCE_S = 0.2
 """A camera that has been silent for so long is taken to have nothing to say, and its time goes on."""
 GRACE_S = 0.5
-"""Who leaves is released when nothing has come for so long: zenoh may tell of it before the last packets."""
+"""A camera whose publishers have left is released when nothing has come for so long: word of their leaving
+may overtake their last packets."""
 _RESTORED_S = 10.0
 """A camera of a snapshot is waited for so long: links come up again within a few seconds."""
+_EVENTS_OF_TIME = {
+    "restarts": "clock restarted",
+    "jumps": "clock jumped",
+    "wraps": "clock wrapped",
+    "stray packets": "stray packet",
+    "stray events": "stray events",
+}
+"""Reasons of warnings, by what a timeline calls them."""
 
-
-class Warnings:
-    """Counts by reason, and says so once a second and reason at most.
-
-    Args:
-        say: given a line of text.
-        clock: seconds, monotonic.
-    """
-
-    def __init__(
-        self, say: Callable[[str], None] = lambda line: None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        """Nothing counted yet."""
-        self.counts: Counter[str] = Counter()
-        self._say = say
-        self._clock = clock
-        self._next: dict[str, float] = {}
-        self._silent: Counter[str] = Counter()
-
-    @classmethod
-    def on(cls, console: Console | None) -> Self:
-        """Say it there, or only count."""
-        if console is None:
-            return cls()
-        return cls(partial(console.print, style="yellow", markup=False, soft_wrap=True))
-
-    def add(self, reason: str, topic: str, detail: str) -> None:
-        """Count one, and say it unless that reason was said less than a second ago."""
-        self.counts[reason] += 1
-        now = self._clock()
-        if now < self._next.get(reason, now):
-            self._silent[reason] += 1
-            return
-        self._next[reason] = now + 1.0
-        more = self._silent.pop(reason, 0)
-        self._say(f"{reason}: {topic}: {detail}" + (f" ({more} more of these)" if more else ""))
+Item = Packet | Label | Watermark | CameraLeft
 
 
 class Intake:
@@ -97,7 +68,7 @@ class Intake:
         window_us: of the encoder; a silent camera's time goes on until its window is empty.
         warnings: told what is refused and what is strange.
         silence_s: how long a camera must be silent before its time goes on without it.
-        mark_s: how often to put a mark into the stream, if anything came meanwhile.
+        mark_s: how often to put a barrier into the stream, if anything came meanwhile.
         joins_late: packets before the first that is heard are missing from its window.
     """
 
@@ -117,7 +88,8 @@ class Intake:
         self._warnings = warnings
         self._silence_s = silence_s
         self.topics: dict[str, TopicState] = {}
-        self._past = DeliveryStats()
+        self._outputs: dict[str, str] = {}
+        self._past, self._past_counts = DeliveryStats(), Counter[str]()
         self._early: dict[str, Label] = {}
         self._leaving: dict[str, float] = {}
         self._awaited: dict[str, float] = {}
@@ -131,24 +103,23 @@ class Intake:
     def restore(self, topic: str, values: Fields, passed_ns: int) -> None:
         """Go on with a topic from a snapshot, before anything is taken.
 
-        Its time stands still until it is heard; if that does not happen soon, it is gone.
+        Its time stands still until it is heard; if that does not happen soon, it is released.
 
         Args:
-            topic: which.
+            topic: its name.
             values: what `snapshot` gave for it.
             passed_ns: since then.
 
         Raises:
-            InputError: the values are not a snapshot.
+            InputError: the values are not those of a topic.
         """
         now_ns = time.monotonic_ns()
-        state = TopicState(PacketReader(topic, MAX_LIVE_PACKET_EVENTS), CameraClock(self._window_us))
+        state = self._follow(topic)
         state.restore(values, now_ns - passed_ns)
         state.heard_ns = now_ns
-        self.topics[topic] = state
         self._awaited[topic] = 0.0
 
-    def __iter__(self) -> Iterator[Packet | Label | Watermark | CameraLeft | Barrier | None]:
+    def __iter__(self) -> Iterator[Item | Barrier | None]:
         """Yield items as they come; None when nothing more is there at the moment."""
         looked = marked = time.monotonic()
         is_new, refused = False, 0
@@ -173,16 +144,25 @@ class Intake:
             if not self._inbox.depth:
                 yield from self._releases(passed_s)
                 yield None
+        for topic, state in self.topics.items():
+            yield from self._handed_on(topic, state, state.timeline.finish())
 
     def delivery(self) -> DeliveryStats:
         """Totals of all topics, past and present; may be called from another thread."""
         total = DeliveryStats()
-        for part in (self._past, *(state.delivery.stats for state in list(self.topics.values()))):
+        for part in (self._past, *(state.timeline.delivery.stats for state in list(self.topics.values()))):
             total += part
         return total
 
+    def counts(self) -> Counter[str]:
+        """What happened to packets and their times, of all topics, see `messages.timeline.Timeline.counts`.
+
+        May be called from another thread.
+        """
+        return sum((state.timeline.counts for state in list(self.topics.values())), self._past_counts)
+
     def _announced(self, topic: str, *, here: bool) -> None:
-        """Publishers come or leave. Who comes next is heard at once; who left may have packets under way."""
+        """Publishers come or leave. The next one is heard at once; the last may have packets under way."""
         self._leaving.pop(topic, None)
         self._awaited.pop(topic, None)
         if not here:
@@ -190,191 +170,199 @@ class Intake:
             if len(self._leaving) > MAX_TOPICS:
                 del self._leaving[next(iter(self._leaving))]
         if topic in self.topics:
-            self.topics[topic].delivery.announced(here=here)
+            self.topics[topic].timeline.delivery.announced(here=here)
 
-    def _release(self, topic: str, state: TopicState) -> CameraLeft:
+    def _release(self, topic: str) -> Iterator[Item]:
         """Nobody publishes here any more: what comes next is another life of this camera."""
-        state.reader = PacketReader(topic, MAX_LIVE_PACKET_EVENTS)
-        state.clock = CameraClock(self._window_us)
-        state.stream_us, state.heard_ns, state.label_end_us = None, 0, 0
-        return CameraLeft(topic)
+        state = self.topics[topic]
+        yield from self._handed_on(topic, state, state.timeline.finish())
+        state.timeline.begin()
+        state.heard_ns, state.label_end_us, state.is_served = 0, 0, False
+        yield CameraLeft(topic)
 
-    def _releases(self, passed_s: float) -> Iterator[CameraLeft]:
+    def _releases(self, passed_s: float) -> Iterator[Item]:
         for topic, awaited_s in list(self._awaited.items()):
             self._awaited[topic] = awaited_s + passed_s
             if awaited_s > _RESTORED_S:
                 del self._awaited[topic]
-                yield self._release(topic, self.topics[topic])
+                yield from self._release(topic)
         for topic, silent_s in list(self._leaving.items()):
             self._leaving[topic] = silent_s + passed_s
             if silent_s > GRACE_S:
                 del self._leaving[topic]
                 if topic in self.topics:
-                    yield self._release(topic, self.topics[topic])
+                    yield from self._release(topic)
 
-    def _items(self, message: RawMessage | Announcement) -> Iterator[Packet | Label | Watermark | CameraLeft]:
+    def _items(self, message: RawMessage | Announcement) -> Iterator[Item]:
         if isinstance(message, Announcement):
             self._announced(message.topic, here=message.here)
             return
         try:
-            if message.schema == LabelMessage.SCHEMA_NAME:
-                yield from self._label(message)
-            elif message.schema in EVENT_SCHEMAS:
+            if message.schema in EVENT_SCHEMAS:
                 yield from self._packet(message)
+            elif message.schema == LabelMessage.SCHEMA_NAME:
+                yield from self._label(message)
             else:
-                raise _RefusalError("unknown type", message.schema[:80] or "not CDR")
-        except _RefusalError as refusal:
+                raise RefusalError("unknown type", message.schema[:80] or "not CDR")
+        except RefusalError as refusal:
             self._warnings.add(refusal.reason, message.topic, str(refusal))
 
-    def _label(self, message: RawMessage) -> Iterator[Label]:
+    def _label(self, message: RawMessage) -> Iterator[Item]:
         """Give a label to the camera beside it, now or when its first packet comes."""
         parent = message.topic.rpartition("/")[0]
-        try:
-            label = Label.from_cdr(message.payload)
-        except InputError as error:
-            raise _RefusalError("bad label", str(error)) from None
-        if not 0 <= label.duration_us <= MAX_LABEL_US:
-            raise _RefusalError("bad label", f"{label.label[:40]!r} lasts {label.duration_us} us")
+        label = checked_label(message)
         for topic in (parent, f"{parent}/events".lstrip("/"), f"{parent}/events"):
             state = self.topics.get(topic)
-            if state and state.stream_us is not None:
-                if abs(label.start_us - state.stream_us) > _MAX_SPAN_US:
-                    raise _RefusalError("bad label", f"it starts at {label.start_us} us, far from the stream")
-                yield self._accept(label, topic, state)
+            if state and state.timeline.reached_us is not None:
+                ahead_us = label.start_us - state.timeline.reached_us
+                if abs(ahead_us) > _MAX_SPAN_US:
+                    raise RefusalError("bad label", f"it starts at {label.start_us} us, far from the stream")
+                if ahead_us > _AHEAD_US:
+                    seconds = ahead_us / 1e6
+                    self._warnings.add("label ahead", topic, f"by {seconds:.1f} s; events before it are late")
+                yield from self._handed_on(topic, state, state.timeline.label(replace(label, topic=topic)))
                 return
         self._early[parent] = label
         while len(self._early) > MAX_TOPICS:
             del self._early[next(iter(self._early))]
 
-    @staticmethod
-    def _accept(label: Label, topic: str, state: TopicState) -> Label:
-        state.label_end_us = label.start_us + label.duration_us
-        return replace(label, topic=topic)
-
-    def _packet(self, message: RawMessage) -> Iterator[Packet | Label | Watermark | CameraLeft]:
-        if message.topic not in self.topics:
-            yield from self._begin(message.topic)
-        state = self.topics[message.topic]
-        self._awaited.pop(message.topic, None)
-        attachment = Attachment.unpack(message.attachment)
-        numbered = attachment or self._number_in(message)
-        unheard = state.delivery.stats.unheard
-        verdict = state.delivery.see(numbered.gid, numbered.seq, message.arrived_ns, message.dropped)
-        if verdict.broken:
-            state.reader.resync()
-        if verdict.restarted:
-            self._warnings.add("publisher restarted", message.topic, f"now {numbered.gid.hex() or 'unnamed'}")
-            if verdict.anew:
-                yield self._release(message.topic, state)
-        state.lost += verdict.lost
-        if self._joins_late:
-            state.lost += state.delivery.stats.unheard - unheard
-        if verdict.foreign:
-            self._warnings.add("second publisher", message.topic, numbered.gid.hex() or "unnamed")
-        if not verdict.use:
+    def _packet(self, message: RawMessage) -> Iterator[Item]:
+        """Parse, number, decode and place one message of events."""
+        topic = message.topic
+        content, refusal = parsed(message)
+        state = self.topics.get(topic)
+        if state is None:
+            if content is None:
+                raise refusal
+            yield from self._make_room(topic)
+            state = self._follow(topic)
+        if self._awaited:
+            self._awaited.pop(topic, None)
+        timeline, attachment = state.timeline, Attachment.unpack(message.attachment)
+        number = (attachment.gid, attachment.seq) if attachment else None
+        if content is None and number is None:
+            timeline.miss()
+            raise refusal
+        seen = timeline.see(content, message.arrived_ns, number=number, dropped=message.dropped)
+        if seen.restarted or seen.foreign or seen.lost:
+            self._tell_of(seen, topic, number)
+            if seen.anew:
+                yield from self._release(topic)
+        if not seen.use:
             return
-        if message.topic in self._leaving:
-            self._leaving[message.topic] = 0.0
-        if verdict.lost:
-            self._warnings.add(
-                "packets missing", message.topic, f"{verdict.lost} before number {numbered.seq}"
-            )
-        try:
-            packet = self._placed(state, message, numbered)
-        except _RefusalError:
-            state.lost += 1
-            raise
-        parent = message.topic.removesuffix("/events")
-        early = self._early.pop(parent if parent != "events" else "", None)
-        if early and state.stream_us is not None and abs(early.start_us - state.stream_us) <= _MAX_SPAN_US:
-            yield self._accept(early, message.topic, state)
-        yield replace(packet, lost=state.lost)
-        state.lost = 0
-        if len(packet.events) == 0 and state.stream_us is not None:
-            yield Watermark(message.topic, state.stream_us)
-
-    def _placed(self, state: TopicState, message: RawMessage, numbered: Attachment) -> Packet:
-        """Decode a packet and bring its times onto the stream's."""
-        if message.problem:
-            raise _RefusalError(message.problem, f"at most {MAX_PAYLOAD_BYTES} bytes are read")
-        try:
-            packet = state.reader.read(message.schema, message.payload, message.log_time_ns, numbered.seq)
-        except InputError as error:
-            raise _RefusalError("bad packet", str(error)) from None
-        height, width = packet.resolution
-        if height * width > MAX_PIXELS:
-            raise _RefusalError("sensor too large", f"{width}x{height} pixels, at most {MAX_PIXELS}")
-        if state.resolution not in (None, packet.resolution):
-            self._warnings.add("resolution changed", message.topic, f"now {width}x{height}")
-        events = packet.events
-        # Events outside the sensor are rejected later; their times have no say.
-        sound = events["t"][(events["x"] < width) & (events["y"] < height)]
-        first = last = state.reader.time_us
-        if len(sound):
-            first, last = int(sound.min()), int(sound.max())
-        if first is not None and last is not None:
-            if last - first > _MAX_SPAN_US:
-                raise _RefusalError(
-                    "bad times", f"events of one packet are {(last - first) // 1_000_000} s apart"
-                )
-            if first < 0 or last > MAX_STREAM_US:
-                raise _RefusalError("bad times", f"an event at {first if first < 0 else last} us")
-            place = state.clock.place(first, last, message.arrived_ns)
-            if place.event:
-                self._warnings.add(f"clock {place.event}", message.topic, f"{first} us")
-            if place.offset_us:
-                events = events.copy()
-                events["t"] += np.int64(place.offset_us)
-            if place.event in ("restarted", "jumped"):
-                state.stream_us = None
-            state.stream_us = max(state.stream_us or 0, last + place.offset_us)
-            packet = replace(packet, events=events, epoch=place.epoch)
-        state.resolution = packet.resolution
-        state.packets += 1
-        state.payload_bytes += len(message.payload)
-        state.heard_ns, state.silent_s = message.arrived_ns, 0.0
-        return replace(packet, source_ns=numbered.source_ns)
-
-    @staticmethod
-    def _number_in(message: RawMessage) -> Attachment:
-        """What a packet says of itself, for publishers that attach nothing."""
-        if message.schema == EventPacket.SCHEMA_NAME and not message.problem:
-            try:
-                packet = EventPacket.from_cdr(message.payload)
-            except InputError as error:
-                raise _RefusalError("bad packet", str(error)) from None
-            return Attachment(min(packet.seq, (1 << 63) - 1), packet.stamp_ns, b"")
-        reason = message.problem or "no sequence number"
-        raise _RefusalError(reason, f"{len(message.attachment)} bytes of attachment")
-
-    def _begin(self, topic: str) -> Iterator[CameraLeft]:
-        """Follow one topic more; the one that has been silent for longest makes room for it."""
-        if len(self.topics) >= MAX_TOPICS:
-            oldest = min(self.topics, key=lambda name: self.topics[name].heard_ns)
-            if time.monotonic_ns() - self.topics[oldest].heard_ns < _FORGOTTEN_NS:
-                raise _RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
-            self._past = self._past + self.topics.pop(oldest).delivery.stats
-            self._awaited.pop(oldest, None)
-            yield CameraLeft(oldest)
-        reader = PacketReader(topic, MAX_LIVE_PACKET_EVENTS)
-        state = self.topics[topic] = TopicState(reader, CameraClock(self._window_us))
         if topic in self._leaving:
-            state.delivery.announced(here=False)
+            self._leaving[topic] = 0.0
+        if content is None:
+            timeline.miss()
+            raise refusal
+        if attachment:
+            seq, source_ns = attachment.seq, attachment.source_ns
+        else:
+            seq, source_ns = 0, content.stamp_ns
+        arrived_ns = message.arrived_ns
+        about = message.schema, content, seen, message.log_time_ns, seq
+        try:
+            items = timeline.take(*about, now_ns=arrived_ns, source_ns=source_ns)
+        except InputError as error:
+            raise RefusalError("bad packet", str(error)) from None
+        state.heard_ns, state.silent_s = arrived_ns, 0.0
+        yield from self._handed_on(topic, state, items)
 
-    def _silences(self, passed_s: float) -> Iterator[Watermark]:
+    def _handed_on(self, topic: str, state: TopicState, items: Iterable[Packet | Label]) -> Iterator[Item]:
+        """Items of a topic as they leave its timeline."""
+        for item in items:
+            if isinstance(item, Label):
+                state.label_end_us = item.start_us + item.duration_us
+            else:
+                if item.resolution != state.resolution:
+                    if state.resolution:
+                        height, width = item.resolution
+                        self._warnings.add("resolution changed", topic, f"now {width}x{height}")
+                    state.resolution = item.resolution
+                if not state.is_served:
+                    yield from self._give_place(topic)
+                    state.is_served = True
+                if self._early:
+                    yield from self._early_label(topic, state)
+            yield item
+
+    def _early_label(self, topic: str, state: TopicState) -> Iterator[Label]:
+        """The label that came before the first packet of its camera."""
+        reached_us = state.timeline.reached_us
+        if reached_us is None:
+            return
+        parent = topic.removesuffix("/events")
+        label = self._early.pop(parent if parent != "events" else "", None)
+        if label and abs(label.start_us - reached_us) <= _MAX_SPAN_US:
+            state.label_end_us = label.start_us + label.duration_us
+            yield replace(label, topic=topic)
+
+    def _tell_of(self, seen: Verdict, topic: str, number: tuple[bytes, int] | None) -> None:
+        """Warn of what numbers show."""
+        publisher = (number[0].hex() if number else "") or "unnamed"
+        if seen.restarted:
+            self._warnings.add("publisher restarted", topic, f"now {publisher}")
+        if seen.foreign:
+            self._warnings.add("second publisher", topic, publisher)
+        if seen.use and seen.lost:
+            before = f" before number {number[1]}" if number else ""
+            self._warnings.add("packets missing", topic, f"{seen.lost}{before}")
+
+    def _follow(self, topic: str) -> TopicState:
+        """Follow one topic more."""
+        timeline = Timeline(
+            topic,
+            max_events=MAX_LIVE_PACKET_EVENTS,
+            joins_late=self._joins_late,
+            tell=lambda what, detail: self._warnings.add(_EVENTS_OF_TIME[what], topic, detail),
+        )
+        state = self.topics[topic] = TopicState(timeline)
+        self._outputs[beside(topic, "")] = topic
+        if topic in self._leaving:
+            timeline.delivery.announced(here=False)
+        return state
+
+    def _make_room(self, topic: str) -> Iterator[Item]:
+        """See that one topic more can be followed; one that has been silent for long makes room for it."""
+        other = self._outputs.get(beside(topic, ""))
+        if other is not None:
+            raise RefusalError("one name for two outputs", f"{beside(topic, 'features')} is that of {other}")
+        if len(self.topics) >= MAX_TOPICS:
+            oldest = self._longest_silent(list(self.topics))
+            if oldest is None:
+                raise RefusalError("too many topics", f"{MAX_TOPICS} are followed already")
+            yield from self._release(oldest)
+            timeline = self.topics.pop(oldest).timeline
+            del self._outputs[beside(oldest, "")]
+            self._past = self._past + timeline.delivery.stats
+            self._past_counts = self._past_counts + timeline.counts
+            self._awaited.pop(oldest, None)
+
+    def _give_place(self, topic: str) -> Iterator[Item]:
+        """If all places for cameras are taken, release the camera that has been silent for longest."""
+        served = [one for one, state in self.topics.items() if state.is_served and one != topic]
+        if len(served) >= MAX_CAMERAS and (oldest := self._longest_silent(served)) is not None:
+            yield from self._release(oldest)
+
+    def _longest_silent(self, topics: Sequence[str]) -> str | None:
+        """The topic that has been silent for longest, if that is long enough to forget it."""
+        oldest = min(topics, key=lambda name: self.topics[name].heard_ns)
+        silent_ns = time.monotonic_ns() - self.topics[oldest].heard_ns
+        return oldest if silent_ns >= _FORGOTTEN_NS else None
+
+    def _silences(self, passed_s: float) -> Iterator[Item]:
+        """Let the time of silent cameras go on, and use what was held for the packet that does not come."""
         for topic, state in self.topics.items():
-            if state.stream_us is None or topic in self._awaited:
-                continue
             state.silent_s += passed_s
-            now_us = state.stream_us + int((state.silent_s - self._silence_s) * 1e6)
-            end_us = max(state.stream_us + 2 * self._window_us, state.label_end_us + 1)
-            if state.stream_us < now_us and now_us - int(passed_s * 1e6) <= end_us:
+            timeline = state.timeline
+            if timeline.is_holding:
+                if state.silent_s * 1e9 > HOLD_NS:
+                    yield from self._handed_on(topic, state, timeline.finish())
+                continue
+            reached_us = timeline.reached_us
+            if reached_us is None or topic in self._awaited:
+                continue
+            now_us = reached_us + int((state.silent_s - self._silence_s) * 1e6)
+            end_us = max(reached_us + 2 * self._window_us, state.label_end_us + 1)
+            if reached_us < now_us and now_us - int(passed_s * 1e6) <= end_us:
                 yield Watermark(topic, now_us)
-
-
-class _RefusalError(Exception):
-    """A message that cannot be used."""
-
-    def __init__(self, reason: str, detail: str) -> None:
-        super().__init__(detail)
-        self.reason = reason

@@ -23,7 +23,7 @@ from streamfeat.errors import InputError
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import SILENCE_S, Intake, Warnings
+from streamfeat.live.intake import SILENCE_S, Intake
 from streamfeat.live.names import Names, PlainNames, RosNames, beside
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.publisher import OutputSink
@@ -31,6 +31,7 @@ from streamfeat.live.screen import HealthTable
 from streamfeat.live.shard import Shard
 from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import Barrier
+from streamfeat.live.warnings import Warnings
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission, EmitPolicy
@@ -172,7 +173,7 @@ class ListenJob:
             checkpointed: list[Sink[Emission]] = []
             published: list[Sink[Emission]] = []
             if self._publish:
-                published = [OutputSink(session, self._names, self.health.on_published)]
+                published = [OutputSink(session, self._names, self.health.on_published, self._on_unpublished)]
             written = sinks()
             if self._state:
                 # Last of the sinks: what it keeps says that all others have written.
@@ -255,6 +256,9 @@ class ListenJob:
 
     def _is_behind(self, log_time_ns: int) -> bool:
         return time.time_ns() - log_time_ns > self._patience_ns
+
+    def _on_unpublished(self, topic: str, error: str) -> None:
+        self._warnings.add("not published", topic, error)
 
     def _on_refusal(self, topic: str, reason: str, error: str) -> None:
         self._warnings.add(reason, topic, error)

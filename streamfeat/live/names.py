@@ -22,6 +22,7 @@ from streamfeat.messages.packets import EVENT_SCHEMAS
 __all__ = [
     "ATTACHMENT_BYTES",
     "OUTPUTS",
+    "ROS_DISTROS",
     "TYPE_HASHES",
     "Attachment",
     "Names",
@@ -43,6 +44,11 @@ TYPE_HASHES = {
     LabelMessage.SCHEMA_NAME: "RIHS01_8628ace0abeb810e80b9decde2d5e99da336c4a6787679217f24d336bd884632",
 }
 """The ROS 2 type hash of each message (REP-2016): SHA-256 of its type description."""
+_NO_HASH = "TypeHashNotSupported"
+"""What rmw_zenoh writes in place of a hash where ROS 2 has none: in Humble, and for types without one."""
+
+ROS_DISTROS = {"humble": False, "iron": True, "jazzy": True, "kilted": True, "lyrical": True, "rolling": True}
+"""Distributions of ROS 2, and whether their keys have type hashes."""
 
 _CDR = "application/cdr"
 _UNNAMED = {"zenoh/bytes", "application/octet-stream", _CDR, ""}
@@ -192,10 +198,15 @@ class PlainNames:
 
 @dataclass(frozen=True, slots=True)
 class RosNames:
-    """ROS 2 over rmw_zenoh: a topic has a leading slash; `expression` may hold wildcards."""
+    """ROS 2 over rmw_zenoh: a topic has a leading slash; `expression` may hold wildcards.
+
+    Subscriptions hear keys with any hash. Keys to publish on have none where `has_hashes` is false: in
+    Humble, whose subscribers hear no other.
+    """
 
     expression: str
     domain: int = 0
+    has_hashes: bool = True
 
     def __post_init__(self) -> None:
         """Check the arguments.
@@ -240,11 +251,11 @@ class RosNames:
 
     def key(self, topic: str, schema: str) -> str:
         """See `Names`."""
-        return f"{self._base(topic, schema)}/{TYPE_HASHES[schema]}"
+        return f"{self._base(topic, schema)}/{type_hash(schema, self.has_hashes)}"
 
     def only(self, topic: str) -> "RosNames":
         """See `Names`."""
-        return RosNames(topic, self.domain)
+        return RosNames(topic, self.domain, self.has_hashes)
 
     def _base(self, topic: str, schema: str) -> str:
         return f"{self.domain}{topic}/{ros_type(schema)}"
@@ -262,15 +273,28 @@ def schema_of_ros(name: str) -> str | None:
     return known.get(name)
 
 
+def type_hash(schema: str, has_hashes: bool) -> str:
+    """The last part of a ROS 2 key."""
+    return TYPE_HASHES.get(schema, _NO_HASH) if has_hashes else _NO_HASH
+
+
 def ros_entity_token(
-    domain: int, zid: str, entity: int, kind: str, node: str, topic: str = "", schema: str = ""
+    domain: int,
+    zid: str,
+    entity: int,
+    kind: str,
+    node: str,
+    topic: str = "",
+    schema: str = "",
+    *,
+    has_hashes: bool = True,
 ) -> str:
     """The liveliness token of a node (`NN`), a publisher (`MP`) or a subscription (`MS`)."""
     token = f"{_ROS_TOKEN}/{domain}/{zid}/0/{entity}/{kind}/%/%/{node}"
     if not topic:
         return token
-    type_hash = TYPE_HASHES.get(schema, "TypeHashNotSupported")
-    return f"{token}/{topic.replace('/', '%')}/{ros_type(schema)}/{type_hash}/{_QOS}"
+    about = ros_type(schema), type_hash(schema, has_hashes), _QOS
+    return "/".join((token, topic.replace("/", "%"), *about))
 
 
 def gid_of(token: str) -> bytes:

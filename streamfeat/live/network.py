@@ -51,6 +51,9 @@ _MEETING_S = 8.0
 """How long a busy machine may take to answer a session that connects, before the port is taken for another
 program's."""
 _POLL_S = 0.01
+_MOST_TOKENS = 1 << 14
+"""Announcements that are kept; anybody can make more."""
+_DOMAIN = re.compile("[0-9]{1,3}")
 _RUST_PLACE = re.compile(r",? at /\S+\.rs(:\d+)?\.?")
 
 
@@ -230,6 +233,8 @@ class FoundTopic:
 def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic]:
     """Find topics that events are published on; those of plain keys if their publishers declare a token.
 
+    At most 16,384 announcements are looked at; those that name no topic are passed over.
+
     Args:
         session: open.
         seconds: how long; sessions need some milliseconds to find one another.
@@ -238,7 +243,8 @@ def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic
 
     def on_token(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            tokens[str(sample.key_expr)] = None
+            if len(tokens) < _MOST_TOKENS:
+                tokens[str(sample.key_expr)] = None
         else:
             tokens.pop(str(sample.key_expr), None)
 
@@ -257,8 +263,8 @@ def find_topics(session: zenoh.Session, seconds: float = 1.0) -> list[FoundTopic
         if token.startswith("@ros2_lv/"):
             domain = token.split("/")[1]
             topic = ros.token_topic(token)
-            if topic and domain.isdecimal():
+            if topic.strip("/") and _DOMAIN.fullmatch(domain):
                 found[topic, "ros2", int(domain)] += 1
-        else:
-            found[plain.token_topic(token), "zenoh", -1] += 1
+        elif topic := plain.token_topic(token):
+            found[topic, "zenoh", -1] += 1
     return sorted(FoundTopic(*which, n) for which, n in found.items())

@@ -115,7 +115,8 @@ def _identity(
     """Tokens of a publisher, and the 16 bytes that name it."""
     if isinstance(names, RosNames):
         zid = str(session.zid())
-        token = ros_entity_token(names.domain, zid, entity, "MP", "streamfeat", topic, schema)
+        about = "MP", "streamfeat", topic, schema
+        token = ros_entity_token(names.domain, zid, entity, *about, has_hashes=names.has_hashes)
         return [ros_entity_token(names.domain, zid, 0, "NN", "streamfeat"), token], gid_of(token)
     gid = os.urandom(16)
     if isinstance(names, PlainNames) and schema == EventPacket.SCHEMA_NAME:
@@ -130,6 +131,7 @@ class OutputSink:
         session: open; not closed here.
         names: plain or ROS 2.
         on_published: given `source_ns` of the emission and the time now, both since 1970.
+        on_refusal: told topic and error where an emission cannot be published; the others are.
     """
 
     def __init__(
@@ -137,8 +139,10 @@ class OutputSink:
         session: zenoh.Session,
         names: Names,
         on_published: Callable[[int, int], None] = lambda source_ns, now_ns: None,
+        on_refusal: Callable[[str, str], None] = lambda topic, error: None,
     ) -> None:
         """Nothing is declared before there is something to publish."""
+        self._on_refusal = on_refusal
         self._session = session
         self._names = names
         self._on_published = on_published
@@ -148,13 +152,19 @@ class OutputSink:
     def write(self, emissions: Sequence[Emission]) -> None:
         """Publish features for each emission, and a prediction where there is one."""
         for e in emissions:
-            stamp_ns = e.t_us * 1000
-            features = FeaturesMessage(stamp_ns, "", e.n_events, e.features, e.incomplete)
-            self._publisher(e.topic, "features").put(features.to_cdr())
-            if e.prediction is not None:
-                prediction = PredictionMessage(stamp_ns, "", e.prediction, e.labels, e.scores)
-                self._publisher(e.topic, "prediction").put(prediction.to_cdr())
-            self._on_published(e.source_ns, time.time_ns())
+            try:
+                self._publish(e)
+            except InputError as error:
+                self._on_refusal(e.topic, str(error))
+
+    def _publish(self, e: Emission) -> None:
+        stamp_ns = e.t_us * 1000
+        features = FeaturesMessage(stamp_ns, "", e.n_events, e.features, e.incomplete)
+        self._publisher(e.topic, "features").put(features.to_cdr())
+        if e.prediction is not None:
+            prediction = PredictionMessage(stamp_ns, "", e.prediction, e.labels, e.scores)
+            self._publisher(e.topic, "prediction").put(prediction.to_cdr())
+        self._on_published(e.source_ns, time.time_ns())
 
     def close(self, *, failed: bool) -> None:
         """Undeclare everything."""

@@ -18,13 +18,14 @@ from rich.console import Console
 
 from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import Warnings
 from streamfeat.live.names import Attachment, Names
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.subscription import Subscription
 from streamfeat.live.topic import MAX_TOPICS
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
-from streamfeat.messages.delivery import Delivery, DeliveryStats
+from streamfeat.messages.delivery import DeliveryStats
+from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.signals import run_until_interrupted, signals_wait
@@ -33,6 +34,8 @@ from streamfeat.stream.sinks import open_sinks
 __all__ = ["RecordJob"]
 
 _POLL_S = 0.05
+_MAX_WRITTEN = 4096
+"""Topics of one file, whose format has room for 65,535."""
 _MESSAGES = {kind.SCHEMA_NAME: kind for kind in (EventPacket, EventArray, LabelMessage)}
 
 
@@ -76,7 +79,8 @@ class RecordJob:
         self._network = network
         self._inbox = Inbox()
         self._warnings = Warnings.on(console)
-        self._topics: dict[str, Delivery] = {}
+        self._topics: dict[str, Timeline] = {}
+        self._past = DeliveryStats()
         self._written: Counter[str] = Counter()
         self._bytes = 0
         self._seconds = 0.0
@@ -118,7 +122,7 @@ class RecordJob:
 
     def result(self) -> dict[str, Any]:
         """What happened, as JSON values."""
-        delivery = sum((topic.stats for topic in self._topics.values()), DeliveryStats())
+        delivery = sum((topic.delivery.stats for topic in self._topics.values()), self._past)
         return {
             "written": str(self._target),
             "topics": sorted(self._written),
@@ -140,7 +144,7 @@ class RecordJob:
             for message in taken:
                 if isinstance(message, Announcement):
                     if message.topic in self._topics:
-                        self._topics[message.topic].announced(here=message.here)
+                        self._topics[message.topic].delivery.announced(here=message.here)
                 elif self._is_wanted(message):
                     self._written[message.topic] += 1
                     self._bytes += len(message.payload)
@@ -163,19 +167,21 @@ class RecordJob:
         except InputError as error:
             self._warnings.add("bad message", message.topic, str(error))
             return False
-        attachment = Attachment.unpack(message.attachment)
-        if isinstance(content, LabelMessage) or (attachment is None and not isinstance(content, EventPacket)):
+        if message.topic not in self._written and len(self._written) >= _MAX_WRITTEN:
+            self._warnings.add("too many topics", message.topic, f"{_MAX_WRITTEN} are in this file already")
+            return False
+        if isinstance(content, LabelMessage):
             return True
         if message.topic not in self._topics and len(self._topics) >= MAX_TOPICS:
-            self._warnings.add("too many topics", message.topic, f"{MAX_TOPICS} are recorded already")
-            return False
-        delivery = self._topics.setdefault(message.topic, Delivery())
-        seq = content.seq if isinstance(content, EventPacket) else 0
-        gid, seq = (attachment.gid, attachment.seq) if attachment else (b"", seq)
-        verdict = delivery.see(gid, seq, message.arrived_ns, message.dropped)
-        if verdict.lost:
-            self._warnings.add("packets missing", message.topic, f"{verdict.lost} before number {seq}")
-        return verdict.use
+            # The one that was heard first: if it goes on, its numbers are followed anew.
+            self._past += self._topics.pop(next(iter(self._topics))).delivery.stats
+        timeline = self._topics.setdefault(message.topic, Timeline(message.topic))
+        attachment = Attachment.unpack(message.attachment)
+        number = (attachment.gid, attachment.seq) if attachment else None
+        seen = timeline.see(content, message.arrived_ns, number=number, dropped=message.dropped)
+        if seen.lost:
+            self._warnings.add("packets missing", message.topic, f"{seen.lost} before this one")
+        return seen.use
 
 
 class _Unchanged:

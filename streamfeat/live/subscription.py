@@ -17,9 +17,9 @@ from zenoh.handlers import Callback
 
 from streamfeat.errors import InputError
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import MAX_PAYLOAD_BYTES
 from streamfeat.live.names import ATTACHMENT_BYTES, OUTPUTS, Names, RosNames, ros_entity_token
 from streamfeat.live.network import first_line, is_of
+from streamfeat.live.refusals import MAX_NAME, problem_of
 from streamfeat.live.shard import Shard
 from streamfeat.live.topic import MAX_TOPICS
 from streamfeat.messages.packets import EVENT_SCHEMAS
@@ -30,6 +30,9 @@ _HISTORY = 256
 """Packets that a reliable subscriber asks a publisher for when it joins late."""
 _MAX_TOKENS = 1 << 14
 """Publishers that are known at a time; announcements of further ones are refused and counted."""
+_LONGEST_TOKEN = 4096
+_LONGEST_TYPE = 256
+"""Characters; longer tokens are refused and counted, longer types are cut."""
 _MAX_COME = 1 << 10
 """Announced topics that may wait for a subscription."""
 
@@ -74,6 +77,7 @@ class Subscription:
         # zenoh may not be asked for a subscription from within its own callbacks.
         self._come: Queue[str | None] = Queue(_MAX_COME)
         self._follower = threading.Thread(target=self._follow, name="streamfeat follower", daemon=True)
+        self._is_closing = False
         self._tokens: dict[str, set[str]] = {}
         self._n_tokens = 0
         self._open: list[object] = []
@@ -109,26 +113,31 @@ class Subscription:
 
     def close(self) -> None:
         """Unsubscribe; what is in the inbox stays there."""
+        self._is_closing = True
         for declared in reversed(self._open):
             declared.undeclare()  # type: ignore[attr-defined]
         self._open.clear()
         if self._follower.is_alive():
-            self._come.put(None)
+            with suppress(Full):  # what waits there wakes the follower as well
+                self._come.put_nowait(None)
             self._follower.join()
 
     def _follow(self) -> None:
         """Subscribe to each topic that is announced; a publisher that left may have packets under way."""
         followed: dict[str, list[Any]] = {}
-        while (topic := self._come.get()) is not None:
-            if topic in followed:
+        while (topic := self._come.get()) is not None and not self._is_closing:
+            if topic in followed or topic not in self._tokens:
                 continue
+            gone = [one for one in followed if one not in self._tokens]
+            if len(followed) >= MAX_TOPICS:
+                if not gone:
+                    self._inbox.refuse()
+                    continue
+                for declared in followed.pop(gone[0]):
+                    declared.undeclare()
             with suppress(zenoh.ZError, InputError):  # no topic: the token was made up
                 names = self._names.only(topic).subscriptions
                 followed[topic] = [self._subscribe(expression) for expression in names]
-            gone = [one for one in followed if one not in self._tokens]
-            for one in gone[: max(len(followed) - MAX_TOPICS, 0)]:
-                for declared in followed.pop(one):
-                    declared.undeclare()
         for several in followed.values():
             for declared in several:
                 declared.undeclare()
@@ -151,7 +160,8 @@ class Subscription:
         tokens = [ros_entity_token(names.domain, zid, 0, "NN", "streamfeat_listener")]
         if "*" not in names.expression:
             subscribed = (names.expression, EVENT_SCHEMAS[0])
-            tokens.append(ros_entity_token(names.domain, zid, 10, "MS", "streamfeat_listener", *subscribed))
+            about = names.domain, zid, 10, "MS", "streamfeat_listener", *subscribed
+            tokens.append(ros_entity_token(*about, has_hashes=names.has_hashes))
         self._open += [liveliness.declare_token(token) for token in tokens]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
@@ -162,14 +172,13 @@ class Subscription:
         if self._shard and not self._shard.has(topic):
             self._inbox.leave()
             return
-        size = len(sample.payload)
-        problem = "too large" if size > MAX_PAYLOAD_BYTES else ""
+        problem = problem_of(key, topic, len(sample.payload))
         attachment = sample.attachment
         attached = attachment.to_bytes() if attachment and len(attachment) <= ATTACHMENT_BYTES else b""
         self._inbox.put(
             RawMessage(
-                topic,
-                self._names.schema(key, str(sample.encoding)) or "",
+                topic[:MAX_NAME],
+                (self._names.schema(key, str(sample.encoding)) or "")[:_LONGEST_TYPE],
                 b"" if problem else sample.payload.to_bytes(),
                 attached,
                 time.monotonic_ns(),
@@ -179,11 +188,15 @@ class Subscription:
         )
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        topic = self._names.token_topic(str(sample.key_expr))
+        token = str(sample.key_expr)
+        topic = self._names.token_topic(token)
+        if len(token) > _LONGEST_TOKEN or len(topic) > MAX_NAME:
+            self._inbox.refuse()
+            return
         if not topic or (self._shard and not self._shard.has(topic)):
             return
         # As sets: of a token that comes while the subscription is made, zenoh may tell twice.
-        token, tokens = str(sample.key_expr), self._tokens.get(topic, set())
+        tokens = self._tokens.get(topic, set())
         if sample.kind == zenoh.SampleKind.PUT:
             if token in tokens:
                 return

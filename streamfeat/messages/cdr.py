@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
+from streamfeat.messages.cdr_bytes import CdrReader, CdrWriter
 
 __all__ = ["EventArray", "EventPacket", "FeaturesMessage", "LabelMessage", "PredictionMessage"]
-
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 _HEADER_TEXT = """
 ================================================================================
@@ -39,99 +38,6 @@ uint32 nanosec
 
 def _schema(fields: str, *more: str) -> str:
     return "std_msgs/Header header\n" + fields + "".join(more) + _HEADER_TEXT + _TIME_TEXT
-
-
-_NUMBERS = {code: struct.Struct(f"<{code}") for code in "BiIqQ"}
-
-
-class _Reader:
-    """Takes one CDR message apart, front to back; every length is checked before it is used."""
-
-    def __init__(self, data: bytes | memoryview, message: str) -> None:
-        self._data = memoryview(data)
-        self._message = message
-        self._at = 4
-        if len(data) < 4:
-            raise InputError(f"{message}: {len(data)} bytes are too few for a CDR message")
-        if self._data[:2] != _LITTLE_ENDIAN[:2]:
-            raise InputError(
-                f"{message}: encapsulation {bytes(self._data[:2]).hex()} at byte 0 is not supported; "
-                "only little-endian XCDR1 (0001) is"
-            )
-
-    def number(self, code: str, field: str) -> int:
-        """Read one integer or boolean of `struct` type `code`."""
-        layout = _NUMBERS[code]
-        at = self._at - (self._at - 4) % -layout.size
-        if at + layout.size > len(self._data):
-            self._at = at
-            self._take(layout.size, field)  # says what is missing
-        self._at = at + layout.size
-        return int(layout.unpack_from(self._data, at)[0])
-
-    def string(self, field: str) -> str:
-        """Read a string; the zero byte that ends it is dropped."""
-        length = self.number("I", field)
-        at = self._at
-        raw = bytes(self._take(length, field))
-        try:
-            return raw.removesuffix(b"\0").decode()
-        except UnicodeDecodeError:
-            raise InputError(f"{self._message}: {field!r} at byte {at} is not UTF-8 text") from None
-
-    def sequence(self, itemsize: int, field: str) -> memoryview:
-        """Read a sequence of items that CDR packs without gaps."""
-        return self._take(self.number("I", field) * itemsize, field)
-
-    def stamp_and_frame(self) -> tuple[int, str]:
-        """Read a `std_msgs/Header`: stamp in nanoseconds, and frame."""
-        sec = self.number("i", "header.stamp.sec")
-        nanosec = self.number("I", "header.stamp.nanosec")
-        return sec * 1_000_000_000 + nanosec, self.string("header.frame_id")
-
-    def rest(self) -> memoryview:
-        """Give all bytes that were not read yet."""
-        return self._data[self._at :]
-
-    def _take(self, size: int, field: str) -> memoryview:
-        left = len(self._data) - self._at
-        if size > left:
-            raise InputError(
-                f"{self._message}: {field!r} at byte {self._at} needs {size} bytes, {max(left, 0)} are left; "
-                "the message is cut short or damaged"
-            )
-        self._at += size
-        return self._data[self._at - size : self._at]
-
-
-class _Writer:
-    """Puts one CDR message together."""
-
-    def __init__(self) -> None:
-        self._out = bytearray(_LITTLE_ENDIAN)
-
-    def number(self, code: str, value: int) -> Self:
-        self._out += bytes(-(len(self._out) - 4) % struct.calcsize(code)) + struct.pack(f"<{code}", value)
-        return self
-
-    def string(self, text: str) -> Self:
-        raw = text.encode() + b"\0"
-        return self.number("I", len(raw)).raw(raw)
-
-    def raw(self, data: bytes | memoryview) -> Self:
-        self._out += data
-        return self
-
-    def stamp_and_frame(self, stamp_ns: int, frame_id: str) -> Self:
-        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-        if not 0 <= sec < 1 << 31:
-            raise InputError(
-                f"a message stamp is 0 or more and less than 2^31 s, not {stamp_ns} ns; shift the times"
-            )
-        return self.number("i", sec).number("I", nanosec).string(frame_id)
-
-    def bytes(self) -> bytes:
-        return bytes(self._out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +67,10 @@ class EventPacket:
         Raises:
             InputError: the bytes are no such message.
         """
-        r = _Reader(data, "EventPacket")
+        at_once = _packet_fields(data)
+        if at_once:
+            return cls(*at_once)
+        r = CdrReader(data, "EventPacket")
         stamp_ns, frame_id = r.stamp_and_frame()
         return cls(
             stamp_ns,
@@ -181,10 +90,48 @@ class EventPacket:
         Raises:
             InputError: the stamp is out of range.
         """
-        w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id)
+        w = CdrWriter().stamp_and_frame(self.stamp_ns, self.frame_id)
         w.number("I", self.height).number("I", self.width).number("Q", self.seq).number("Q", self.time_base)
         w.string(self.encoding).number("B", self.is_bigendian)
         return w.number("I", len(self.events)).raw(self.events).bytes()
+
+
+_PACKET_START = struct.Struct("<HxxiII")
+_PACKET_MIDDLE = {0: struct.Struct("<IIQQI"), 4: struct.Struct("<II4xQQI")}
+"""Sizes, numbers and the length of the encoding, by how far from a multiple of 8 they begin."""
+_PACKET_END = {at: struct.Struct(f"<B{-(at + 1) % 4}xI") for at in range(4)}
+
+
+_PacketFields = tuple[int, str, int, int, int, int, str, bool, memoryview]
+
+
+def _packet_fields(data: bytes | memoryview) -> _PacketFields | None:
+    """The fields of an `EventPacket` in three reads where `CdrReader` needs twelve.
+
+    Returns:
+        None if anything is wrong with the message, which `CdrReader` then names.
+    """
+    try:
+        view = memoryview(data)
+        kind, sec, nanosec, length = _PACKET_START.unpack_from(view)
+        at = 16 + length
+        frame_id = str(view[16:at], "utf-8").removesuffix("\0")
+        at += -at % 4
+        middle = _PACKET_MIDDLE[(at - 4) % 8]
+        height, width, seq, time_base, length = middle.unpack_from(view, at)
+        at += middle.size
+        encoding = str(view[at : at + length], "utf-8").removesuffix("\0")
+        at += length
+        end = _PACKET_END[at % 4]
+        is_bigendian, length = end.unpack_from(view, at)
+        at += end.size
+    except (struct.error, UnicodeDecodeError):
+        return None
+    if kind != 0x0100 or at + length > len(view):
+        return None
+    stamp_ns = sec * 1_000_000_000 + nanosec
+    payload = view[at : at + length]
+    return stamp_ns, frame_id, height, width, seq, time_base, encoding, bool(is_bigendian), payload
 
 
 _DVS_NAMES = ["x", "y", "sec", "nanosec", "polarity"]
@@ -223,7 +170,7 @@ class EventArray:
         Raises:
             InputError: the bytes are no such message.
         """
-        r = _Reader(data, "EventArray")
+        r = CdrReader(data, "EventArray")
         stamp_ns, frame_id = r.stamp_and_frame()
         height, width = r.number("I", "height"), r.number("I", "width")
         n = r.number("I", "events")
@@ -246,7 +193,7 @@ class EventArray:
         Raises:
             InputError: the stamp is out of range.
         """
-        w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id)
+        w = CdrWriter().stamp_and_frame(self.stamp_ns, self.frame_id)
         w.number("I", self.height).number("I", self.width).number("I", len(self.events))
         # The stride holds from the first event on if that event's x and y sit two bytes further back.
         block = np.zeros(len(self.events), np.dtype((np.void, _DVS_STRIDE)))
@@ -284,7 +231,7 @@ class LabelMessage:
         Raises:
             InputError: the bytes are no such message.
         """
-        r = _Reader(data, "Label")
+        r = CdrReader(data, "Label")
         stamp_ns, frame_id = r.stamp_and_frame()
         duration_ns = r.number("Q", "duration_ns")
         return cls(stamp_ns, frame_id, duration_ns, r.string("label"), r.string("split"), r.string("source"))
@@ -297,7 +244,7 @@ class LabelMessage:
         """
         if not 0 <= self.duration_ns < 1 << 64:
             raise InputError(f"label {self.label!r}: a duration of {self.duration_ns} ns is not possible")
-        w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id).number("Q", self.duration_ns)
+        w = CdrWriter().stamp_and_frame(self.stamp_ns, self.frame_id).number("Q", self.duration_ns)
         return w.string(self.label).string(self.split).string(self.source).bytes()
 
 
@@ -324,7 +271,7 @@ class FeaturesMessage:
         Raises:
             InputError: the bytes are no such message.
         """
-        r = _Reader(data, "Features")
+        r = CdrReader(data, "Features")
         stamp_ns, frame_id = r.stamp_and_frame()
         n_events = r.number("Q", "n_events")
         values = np.frombuffer(r.sequence(4, "data"), "<f4")
@@ -336,7 +283,7 @@ class FeaturesMessage:
         Raises:
             InputError: the stamp is out of range.
         """
-        w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id).number("Q", self.n_events)
+        w = CdrWriter().stamp_and_frame(self.stamp_ns, self.frame_id).number("Q", self.n_events)
         w.number("I", len(self.data)).raw(self.data.astype("<f4").tobytes())
         return w.number("B", self.incomplete).bytes()
 
@@ -361,7 +308,7 @@ class PredictionMessage:
         Raises:
             InputError: the bytes are no such message.
         """
-        r = _Reader(data, "Prediction")
+        r = CdrReader(data, "Prediction")
         stamp_ns, frame_id = r.stamp_and_frame()
         label = r.string("label")
         # Each string takes four bytes or more, so a lying count ends at the end of the buffer.
@@ -374,7 +321,7 @@ class PredictionMessage:
         Raises:
             InputError: the stamp is out of range.
         """
-        w = _Writer().stamp_and_frame(self.stamp_ns, self.frame_id).string(self.label)
+        w = CdrWriter().stamp_and_frame(self.stamp_ns, self.frame_id).string(self.label)
         w.number("I", len(self.labels))
         for label in self.labels:
             w.string(label)

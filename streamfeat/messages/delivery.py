@@ -65,6 +65,8 @@ class Verdict(NamedTuple):
         restarted: its publisher is new or counts anew.
         anew: it is the first since every publisher had left.
         foreign: it is of a second publisher.
+        late: it comes after one with a higher number.
+        unheard: numbers before it, if it is the first that reached us.
     """
 
     use: bool
@@ -73,6 +75,8 @@ class Verdict(NamedTuple):
     restarted: bool = False
     anew: bool = False
     foreign: bool = False
+    late: bool = False
+    unheard: int = 0
 
 
 def fingerprint_of(packet: EventPacket) -> int:
@@ -137,6 +141,13 @@ class Delivery:
                 del self._marks[next(iter(self._marks))]
         return verdict
 
+    def see_unnumbered(self, now_ns: int, dropped: int = 0) -> Verdict:
+        """Use the next packet, which has no number to be judged by."""
+        self._heard_ns = now_ns
+        self.stats.dropped += dropped
+        self.stats.received += 1
+        return Verdict(use=True, lost=dropped, broken=dropped > 0)
+
     def _judge(
         self, gid: bytes, seq: int, now_ns: int, dropped: int, mark: int | None, stamp_ns: int
     ) -> Verdict:
@@ -173,17 +184,18 @@ class Delivery:
             "passed_ns": max(now_ns - self._heard_ns, 0),
             "next": self._next,
             "missing": list(self._missing),
+            "stamp_ns": self._stamp_ns,
         }
 
     def restore(self, values: Fields, now_ns: int) -> None:
         """Go on from a snapshot; whether publishers are there is for them to say.
 
         Raises:
-            InputError: the values are not a snapshot.
+            InputError: the values are not those of a topic's numbers.
         """
         stats = values.inner("stats")
         # Packets that come late after all are taken from those that were lost.
-        counts = {field.name: stats.whole(field.name, -_FAR) for field in fields(DeliveryStats)}
+        counts = {field.name: stats.whole(field.name, -_FAR, _NUMBERS) for field in fields(DeliveryStats)}
         self.stats = DeliveryStats(**counts)
         try:
             self._gid = bytes.fromhex(values.text("gid", 64)) if "gid" in values else None
@@ -192,6 +204,9 @@ class Delivery:
         self._heard_ns = now_ns - values.whole("passed_ns")
         self._next = values.whole("next", -_NUMBERS, _NUMBERS)
         self._missing = dict.fromkeys(values.wholes("missing", _REMEMBERED, -_NUMBERS, _NUMBERS))
+        # A file that lacks it must not make every old number a new beginning.
+        stamp_ns = values.maybe("stamp_ns", -_NUMBERS, _NUMBERS)
+        self._stamp_ns = _NUMBERS if stamp_ns is None else stamp_ns
 
     def announced(self, *, here: bool) -> None:
         """The first publisher has come, or the last has left: whoever comes next takes over at once."""
@@ -227,9 +242,17 @@ class Delivery:
         self._old.clear()
         self.stats.received += 1
         self.stats.lost += lost
-        self.stats.unheard += max(seq - 1 - dropped, 0) if first and gid else 0
+        unheard = max(seq - 1 - dropped, 0) if first and gid else 0
+        self.stats.unheard += unheard
         self.stats.restarts += not first
-        return Verdict(use=True, lost=lost + dropped, broken=not first, restarted=not first, anew=anew)
+        return Verdict(
+            use=True,
+            lost=lost + dropped,
+            broken=not first,
+            restarted=not first,
+            anew=anew,
+            unheard=unheard,
+        )
 
     def _see_old(self, seq: int, dropped: int) -> Verdict:
         if seq not in self._missing:
@@ -239,4 +262,4 @@ class Delivery:
         self.stats.lost -= 1
         self.stats.reordered += 1
         self.stats.received += 1
-        return Verdict(use=True, lost=dropped, broken=True)
+        return Verdict(use=True, lost=dropped, broken=True, late=True)

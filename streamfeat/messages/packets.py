@@ -23,16 +23,35 @@ from streamfeat.messages.codecs import (
     encode,
     make_decoder,
 )
-from streamfeat.messages.event_messages import EVENT_SCHEMAS, parse_events
+from streamfeat.messages.event_messages import EVENT_SCHEMAS
 
-__all__ = ["EVENT_SCHEMAS", "MAX_PIXELS", "Label", "Packet", "PacketReader", "PacketWriter", "Watermark"]
+__all__ = [
+    "EVENT_SCHEMAS",
+    "MAX_LABEL_US",
+    "MAX_PIXELS",
+    "MAX_STREAM_US",
+    "Content",
+    "Label",
+    "Packet",
+    "PacketReader",
+    "PacketWriter",
+    "Watermark",
+]
 
 PACKET_EVENTS = 8192
 PACKET_US = 1_000_000  # well inside the 4.29 s of a mono packet, and no packet holds a live reader up
 _MOST_WRAPS = 86_400_000_000 // EVT3_WRAP_US  # in a day
 _MAX_SIDE = 1 << 16  # pixels: coordinates are uint16
+_LARGEST = 1 << 62  # of a number in a snapshot
 MAX_PIXELS = 1 << 22
 """Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
+MAX_LABEL_US = 3_600_000_000
+"""The longest labelled sample of a live topic."""
+MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US
+"""The latest time of a message: times go into message stamps, which have 31 bits of seconds."""
+
+Content = EventPacket | EventArray
+"""A message of events, taken apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +67,7 @@ class Packet:
         source_ns: when it was published, by the publisher's clock; 0 when nobody said.
         lost: packets known to be missing between the one before and this one.
         epoch: counts how often the camera's clock started anew; times of two epochs cannot be compared.
+        until_us: of a packet without events, stream time that it has reached; None where it does not say.
     """
 
     topic: str
@@ -58,6 +78,7 @@ class Packet:
     source_ns: int = 0
     lost: int = 0
     epoch: int = 0
+    until_us: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,67 +105,75 @@ class Label:
         """Read a `streamfeat_msgs/msg/Label`.
 
         Raises:
-            InputError: the bytes are no such message.
+            InputError: the bytes are no such message, or its times cannot be those of a message.
         """
         m = LabelMessage.from_cdr(data)
-        return cls(m.stamp_ns // 1000, m.duration_ns // 1000, m.label, m.split, m.source, topic)
+        start_us, duration_us = m.stamp_ns // 1000, m.duration_ns // 1000
+        if start_us < 0 or start_us + duration_us > MAX_STREAM_US:
+            raise InputError(
+                f"label {m.label[:40]!r} from {start_us} us on, {duration_us} us long: times lie between "
+                f"0 and {MAX_STREAM_US} us"
+            )
+        return cls(start_us, duration_us, m.label, m.split, m.source, topic)
 
 
 class PacketReader:
-    """Turns the event messages of one topic into packets; keeps what decoders carry from one to the next.
-
-    `encoding` is that of the latest message, `time_us` the time it gave for itself, None where it has none.
+    """Decodes the event messages of one topic; keeps what decoders carry from one message to the next.
 
     Args:
-        topic: named in the packets.
         max_events: packets of more events are refused.
+
+    Attributes:
+        encoding: of the latest message.
+        resolution: `(height, width)` of the latest message that could be decoded; None before it.
+        time_us: the time that the latest message gave for itself; None where it has none.
     """
 
-    def __init__(self, topic: str, max_events: int = MAX_PACKET_EVENTS) -> None:
+    def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
         """Start with no decoder."""
         self.encoding = ""
+        self.resolution: Resolution | None = None
         self.time_us: int | None = None
-        self._topic = topic
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
         self._is_broken = False
         self._before: tuple[int, int] | None = None
 
-    def read(
-        self,
-        schema: str,
-        data: bytes | memoryview | EventPacket | EventArray,
-        log_time_ns: int,
-        sequence: int,
-    ) -> Packet:
-        """Read one message, parsed or not; `sequence` stands in where it has no number of its own.
+    def decode(self, schema: str, content: Content) -> Events:
+        """Decode one message.
+
+        Args:
+            schema: its type.
+            content: the message, see `streamfeat.messages.event_messages.parse_events`.
+
+        Returns:
+            `(n,)` array of `EVENT_DTYPE`, times as the camera says, in stored order.
 
         Raises:
-            InputError: the bytes are no such message, or its payload is not what it says.
+            InputError: the payload is not what the message says, or the sensor is not possible.
         """
-        packet = data if isinstance(data, EventPacket | EventArray) else parse_events(schema, data)
-        if isinstance(packet, EventArray):
+        if isinstance(content, EventArray):
+            self.resolution = _resolution(content.height, content.width)
             self.encoding, self.time_us = schema.partition("/")[0], None
-            resolution = _resolution(packet.height, packet.width)
-            return Packet(self._topic, packet.events, resolution, log_time_ns, sequence)
-        if self._last_seq is not None and packet.seq > self._last_seq + 1:
+            return content.events
+        if self._last_seq is not None and content.seq > self._last_seq + 1:
             self.resync()
-        self._last_seq = packet.seq
-        if packet.is_bigendian:
+        self._last_seq = content.seq
+        if content.is_bigendian:
             raise InputError("big-endian payloads are not supported; record with is_bigendian false")
-        resolution = _resolution(packet.height, packet.width)
-        if packet.encoding not in self._decoders:
-            self._decoders[packet.encoding] = make_decoder(packet.encoding, self._max_events)
-        decoder = self._decoders[packet.encoding]
-        events = decoder.decode(packet.events, packet.time_base)
+        resolution = _resolution(content.height, content.width)
+        decoder = self._decoders.get(content.encoding)
+        if decoder is None:
+            decoder = self._decoders[content.encoding] = make_decoder(content.encoding, self._max_events)
+        events = decoder.decode(content.events, content.time_base)
         if isinstance(decoder, Evt3Decoder) and len(events):
-            self._place(decoder, events, packet.stamp_ns)
-        self.encoding = packet.encoding
+            self._place(decoder, events, content.stamp_ns)
+        self.encoding, self.resolution = content.encoding, resolution
         # The times of evt3 are the camera's own; its time_base is on another clock.
-        timed = packet.time_base and packet.encoding != "evt3"
-        self.time_us = packet.time_base // 1000 if timed else None
-        return Packet(self._topic, events, resolution, log_time_ns, packet.seq)
+        timed = content.time_base and content.encoding != "evt3"
+        self.time_us = content.time_base // 1000 if timed else None
+        return events
 
     def snapshot(self) -> dict[str, Any]:
         """What decoders carry on, as JSON values."""
@@ -159,11 +188,11 @@ class PacketReader:
         """Go on from a snapshot.
 
         Raises:
-            InputError: the values are not a snapshot.
+            InputError: the values are not those of a reader.
         """
         self._last_seq = values.maybe("last_seq", 0, 1 << 64)
         self._is_broken = values.flag("is_broken")
-        before = values.wholes("before", 2) if "before" in values else []
+        before = values.wholes("before", 2, -_LARGEST) if "before" in values else []
         self._before = (before[0], before[1]) if len(before) == 2 else None
         decoders = values.inner("decoders")
         for name in PAYLOAD_ENCODINGS:
@@ -192,7 +221,7 @@ class PacketReader:
     def count_wraps(self, n: int) -> None:
         """The times of evt3 have wrapped so often more than was counted, in this packet and from now on."""
         decoder = self._decoders.get("evt3")
-        if isinstance(decoder, Evt3Decoder):
+        if n and isinstance(decoder, Evt3Decoder):
             decoder.count_wraps(n)
             if self._before:
                 self._before = self._before[0], self._before[1] + n * EVT3_WRAP_US
@@ -253,4 +282,6 @@ class PacketWriter:
 def _resolution(height: int, width: int) -> Resolution:
     if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE):
         raise InputError(f"a sensor of height {height} and width {width} is not possible")
+    if height * width > MAX_PIXELS:
+        raise InputError(f"a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
     return height, width

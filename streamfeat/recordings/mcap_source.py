@@ -40,6 +40,9 @@ class McapSource:
     Args:
         path: the file.
 
+    Attributes:
+        damage: where a file without a summary is cut short or damaged first; empty otherwise.
+
     Raises:
         InputError: the file is missing, empty or no MCAP.
     """
@@ -55,7 +58,9 @@ class McapSource:
             summary = read_summary(self._file)
             # Counts from a summary tell what should be there; a scan can only tell what is.
             self._has_summary = summary is not None
-            self._known = summary or _scan(self._file)
+            losses = Losses()
+            self._known = summary or _scan(self._file, losses)
+            self.damage = next(iter(losses.first.values()), "")
         except BaseException:
             self._file.close()
             raise
@@ -124,10 +129,10 @@ class McapSource:
         self._file.close()
 
 
-def _scan(file: BinaryIO) -> Summary:
-    """Build what a summary would say, from the records that are there."""
+def _scan(file: BinaryIO, losses: Losses) -> Summary:
+    """Build what a summary would say, from the records that are there; `losses` is changed."""
     found, counts = Summary(), Counter[int]()
-    for at, record in iter_records(file, Losses()):
+    for at, record in iter_records(file, losses):
         if isinstance(record, Channel):
             found.channels[record.id] = record
         elif isinstance(record, Schema):

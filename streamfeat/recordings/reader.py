@@ -23,6 +23,7 @@ from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import Label, Packet
 from streamfeat.messages.timeline import Timeline
 from streamfeat.recordings.bags import assumptions_of
+from streamfeat.recordings.event_topics import choose_topic
 from streamfeat.recordings.label_topic import labels_for
 from streamfeat.recordings.labels import with_labels
 from streamfeat.recordings.opening import RecordingPath, open_source
@@ -55,7 +56,6 @@ __all__ = [
 ]
 
 _LOOP_GAP_US = 1_000_000
-_TOPICS_SHOWN = 20
 
 _PART_BYTES = 1 << 20
 _MOST_PARTS = 1000
@@ -112,7 +112,7 @@ class Recording(Shown):
         self.assumptions = assumptions_of(self._source)
         try:
             self.path, self.topics = self._source.path, self._source.topics
-            self.topic = _choose_topic(self.path, self.topics, topic)
+            self.topic = choose_topic(self._source, topic)
             self._labels = labels_for(self._source, options.labels, self.topic)
             if self._labels and self._labels.assumption:
                 self.assumptions.append(self._labels.assumption)
@@ -370,7 +370,8 @@ def _shifted(item: Packet | Label, shift_us: int, epochs: int) -> Packet | Label
     events = item.events.copy()
     events["t"] += shift_us
     log_time_ns = item.log_time_ns + shift_us * 1000
-    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns)
+    until_us = None if item.until_us is None else item.until_us + shift_us
+    return replace(item, events=events, epoch=item.epoch + epochs, log_time_ns=log_time_ns, until_us=until_us)
 
 
 def _wherever(path: RecordingPath) -> RecordingPath:
@@ -378,20 +379,3 @@ def _wherever(path: RecordingPath) -> RecordingPath:
     if isinstance(path, str) or not isinstance(path, Sequence):
         return absolute(location_of(path))
     return [absolute(location_of(one)) for one in path]
-
-
-def _choose_topic(path: Location, topics: list[Topic], wanted: str | None) -> str:
-    names = sorted({topic.name for topic in topics if topic.holds == "events"})
-    if not names:
-        others = ", ".join(f"{topic.name} ({topic.schema or 'no type'})" for topic in topics[:_TOPICS_SHOWN])
-        more = f" and {len(topics) - _TOPICS_SHOWN} more" if len(topics) > _TOPICS_SHOWN else ""
-        raise InputError(
-            f"{path}: no topic carries events; " + (f"there are {others}{more}" if topics else "it has none")
-        )
-    if wanted is None and len(names) > 1:
-        raise InputError(
-            f"{path}: {len(names)} topics carry events: {', '.join(names)}; choose one with --topic"
-        )
-    if wanted is not None and wanted not in names:
-        raise InputError(f"{path}: no events on topic {wanted}; --topic can be {', '.join(names)}")
-    return wanted or names[0]

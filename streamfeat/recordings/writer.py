@@ -263,6 +263,8 @@ class RecordingWriter:
     def _channel(self, topic: str, kind: type[_Message | EventArray]) -> int:
         which = f"{topic} {kind.SCHEMA_NAME}"
         if which not in self._channels:
+            if len(self._channels) == _MAX_CHANNELS:
+                raise InputError(f"{self.path}: a recording has at most {_MAX_CHANNELS} channels")
             schema = self._writer.register_schema(kind.SCHEMA_NAME, "ros2msg", kind.SCHEMA.encode())
             self._channels[which] = self._writer.register_channel(topic, "cdr", schema)
         return self._channels[which]

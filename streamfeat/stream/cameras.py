@@ -120,6 +120,8 @@ class Cameras:
             return
         try:
             yield from session.finish()
+        except InputError as error:
+            self._refuse(topic, "unusable", str(error))
         finally:
             self._past = _sum([self._past, session.stats()])
             del self._sessions[topic]

@@ -17,8 +17,7 @@ from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
-from streamfeat.events import Events, Resolution
-from streamfeat.kernels.layout import BEFORE_TIME
+from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.load import Load
@@ -105,7 +104,6 @@ class Session:
         self._state = SessionState(every_us=every_us)
         self._rest_until = self._ahead_from = 0.0
         self._log_time_ns = self._source_ns = 0
-        self._is_label_new = False
         self._stats = SessionStats(correct=0 if classifier else None)
 
     @property
@@ -137,7 +135,6 @@ class Session:
             InputError: it is of another encoder, or of no session at all. This one is no longer of use.
         """
         self._state = snapshot.state.resumed(self._state.every_us)
-        self._is_label_new = self._state.is_untouched
         has_classifier, self._engine = self._stats.correct is not None, None
         self._stats = replace(
             snapshot.stats, correct=(snapshot.stats.correct or 0) if has_classifier else None
@@ -155,7 +152,6 @@ class Session:
         elif isinstance(item, Label):
             yield from self._finish_sample()
             self._state.open_sample(item)
-            self._is_label_new = True
             self._restart()
         else:
             work = self._process_packet(item)
@@ -169,10 +165,12 @@ class Session:
         self._log_time_ns, self._source_ns = packet.log_time_ns, packet.source_ns
         events = packet.events
         if len(events) == 0:
+            if packet.until_us is not None:
+                yield from self._pass_time(packet.until_us)
             return
-        self._is_label_new = False
+        state.touch()
         engine = self._engine_for(packet.resolution)
-        valid = _valid(events, packet.resolution)
+        valid = is_valid(events, packet.resolution)
         latest = state.place(events["t"], valid, self._window_us)
         end = len(events)
         if state.sample and state.sample_end_us is not None:
@@ -208,7 +206,7 @@ class Session:
             self._state.epoch = epoch
             return
         # A label right before the first packet of a new clock is of that clock.
-        if not self._is_label_new:
+        if not self._state.is_untouched:
             yield from self._finish_sample()
         self._state.begin_epoch(epoch)
         self._restart()
@@ -373,14 +371,6 @@ class Session:
                 self._stats.unknown_labels += 1
         self._state.close_sample()
         yield emission
-
-
-def _valid(events: Events, resolution: Resolution) -> NDArray[np.bool_]:
-    """Which events an engine will not reject."""
-    height, width = resolution
-    x, y, p, t = (events[name] for name in ("x", "y", "p", "t"))
-    valid: NDArray[np.bool_] = (x < width) & (y < height) & (p >> 1 == 0)
-    return valid & (t > BEFORE_TIME) & (t < -BEFORE_TIME)
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:

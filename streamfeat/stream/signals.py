@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from typing import Any
 
+from streamfeat.errors import InputError
 from streamfeat.stream.pipeline import Pipeline
 
 __all__ = ["run_until_interrupted", "signals_wait"]
@@ -23,12 +24,27 @@ def signals_wait() -> Iterator[None]:
     """SIGINT and SIGTERM wait until `run_until_interrupted` can hear them, or until the block ends.
 
     For opening sinks: a signal between opening them and running would leave half an output behind.
+
+    Raises:
+        InputError: an event loop is running in this thread, so that pipelines cannot have one of their own.
     """
+    _refuse_running_loop()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _refuse_running_loop() -> None:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return
+    raise InputError(
+        "an event loop is running here already, as in Jupyter: iterate sf.replay(...) or sf.listen(...) with "
+        "`async for`, or `await` the run of a sf.Pipeline"
+    )
 
 
 def run_until_interrupted(
@@ -42,7 +58,11 @@ def run_until_interrupted(
 
     Returns:
         whether there was a signal.
+
+    Raises:
+        InputError: as for `signals_wait`.
     """
+    _refuse_running_loop()
     interrupted = False
 
     def on_signal() -> None:

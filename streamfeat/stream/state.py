@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
-from streamfeat.events import Resolution
+from streamfeat.events import TIME_LIMIT, Resolution
 from streamfeat.files.json_fields import Fields
-from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.messages.packets import Label
 
 __all__ = ["SessionSnapshot", "SessionState", "SessionStats"]
@@ -88,8 +87,8 @@ class SessionState:
     every_us: int = 0
     unread: int = 0
     epoch: int | None = None
-    silent_us: int = BEFORE_TIME
-    incomplete_us: int = BEFORE_TIME
+    silent_us: int = -TIME_LIMIT
+    incomplete_us: int = -TIME_LIMIT
     lost: bool = False
     seen_label: bool = False
     sample: Label | None = None
@@ -99,7 +98,7 @@ class SessionState:
         self.origin_us = self.last_us = origin_us
         self.next_us = None
         self.unread = 0
-        self.silent_us = self.incomplete_us = BEFORE_TIME
+        self.silent_us = self.incomplete_us = -TIME_LIMIT
 
     def open_sample(self, sample: Label) -> None:
         """A labelled sample starts, with an empty window and its own origin."""
@@ -122,8 +121,14 @@ class SessionState:
 
     @property
     def is_untouched(self) -> bool:
-        """Whether a sample is open of which no event has come."""
-        return self.sample is not None and self.last_us == self.sample.start_us and not self.unread
+        """Whether a sample is open, and nothing has come or been emitted since."""
+        return self.sample is not None and self.silent_us < self.sample.start_us
+
+    def touch(self) -> None:
+        """Events come, be they of the open sample or not."""
+        if self.sample:
+            # Nothing is emitted before the start of the sample, so that this moves no emission.
+            self.silent_us = max(self.silent_us, self.sample.start_us)
 
     def begin_epoch(self, epoch: int) -> None:
         """Start anew with the camera's clock: an empty window, with nothing known of what came before.
@@ -145,7 +150,7 @@ class SessionState:
             window_us: length of the window.
         """
         if not valid.all():
-            t = np.where(valid, t, BEFORE_TIME)
+            t = np.where(valid, t, -TIME_LIMIT)
         latest = np.maximum(np.maximum.accumulate(t), self.last_us)
         if self.lost:
             self.incomplete_us = max(self.incomplete_us, int(latest[0]) + window_us)
@@ -220,8 +225,8 @@ class SessionState:
             every_us=every_us,
             unread=values.whole("unread"),
             epoch=values.maybe("epoch"),
-            silent_us=values.whole("silent_us", BEFORE_TIME, _LATEST_US),
-            incomplete_us=values.whole("incomplete_us", BEFORE_TIME, _LATEST_US),
+            silent_us=values.whole("silent_us", -TIME_LIMIT, _LATEST_US),
+            incomplete_us=values.whole("incomplete_us", -TIME_LIMIT, _LATEST_US),
             lost=values.flag("lost"),
             seen_label=values.flag("seen_label"),
             sample=_label(values.inner("sample")) if "sample" in values else None,

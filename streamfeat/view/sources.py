@@ -18,10 +18,11 @@ from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.live.inbox import Inbox
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
 from streamfeat.live.names import Names
 from streamfeat.live.network import THIS_MACHINE, Network
 from streamfeat.live.subscription import Subscription
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Recording, open_recording

@@ -19,6 +19,7 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parents[1]
 sys.path += [str(TESTS), str(TESTS.parent)]
 
+from torture.crowd import crowd  # noqa: E402
 from torture.damage import damaged_recordings  # noqa: E402
 from torture.faults import faults  # noqa: E402
 from torture.fuzz import hostile_bytes  # noqa: E402
@@ -33,6 +34,7 @@ PARTS: dict[str, tuple[Part, str]] = {
     "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
     "state": (state, "kill -9 of a listener that keeps its state"),
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
+    "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
     "soak": (soak, "a day of stream time, 500 million events"),
 }
 

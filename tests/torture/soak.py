@@ -24,7 +24,8 @@ from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
-from streamfeat.messages.packets import Packet, PacketReader, Watermark
+from streamfeat.messages.packets import Packet, Watermark
+from streamfeat.messages.timeline import Timeline
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
@@ -56,6 +57,12 @@ def soak(trials: Trials) -> list[Row]:
     return watch.rows(time.monotonic() - began)
 
 
+def resident_bytes() -> int:
+    """Memory that this process holds."""
+    with open("/proc/self/statm") as file:  # noqa: PTH123
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def _encoder(seed: int) -> Encoder:
     geometry = Geometry(patch=8, stride=4, n_bins=3, bin_us=33_334, max_count=2)
     return random_encoder(seed, geometry, 32, encoding="split", threshold=0.5)
@@ -71,11 +78,11 @@ def _stream(packets: int, seed: int) -> Iterator[Packet | Watermark]:
         t[0] = 0
         x, y, p = (rng.integers(0, most, _EVENTS) for most in (width, height, 2))
         bases.append(encode(make_events(x, y, p, t), "mono")[0])
-    reader, now_us = PacketReader("/events"), 0
+    timeline, now_us = Timeline("/events"), 0
     for i in range(packets):
         about = 0, "", height, width, i, now_us * 1000, "mono", False
         message = EventPacket(*about, bases[i % _BASES]).to_cdr()
-        yield reader.read(EventPacket.SCHEMA_NAME, message, 0, i)
+        yield from timeline.message(EventPacket.SCHEMA_NAME, message, now_us * 1000, i)
         now_us += _PACKET_US
         if i % 10 == 9:
             if i % 20 == 9:  # in the other silences nobody says that time goes on
@@ -164,8 +171,7 @@ class _Watch:
     def _look(self) -> _Held:
         engine = self.session._engine
         assert engine
-        with open("/proc/self/statm") as file:  # noqa: PTH123
-            rss = int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        rss = resident_bytes()
         files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
         state = engine._state
         size = sum(getattr(state, name).nbytes for name in state._fields)

@@ -23,7 +23,7 @@ from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.errors import InputError
 from streamfeat.events import EVENT_DTYPE, Events, make_events
 from streamfeat.live.inbox import Announcement, Inbox, RawMessage
-from streamfeat.live.intake import Intake, Warnings
+from streamfeat.live.intake import Intake
 from streamfeat.live.names import (
     Attachment,
     Names,
@@ -34,6 +34,7 @@ from streamfeat.live.names import (
     gid_of,
     ros_entity_token,
 )
+from streamfeat.live.warnings import Warnings
 from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
 from streamfeat.messages.packets import EVENT_SCHEMAS, Packet
