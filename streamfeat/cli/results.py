@@ -294,6 +294,7 @@ RESULTS: dict[str, dict[str, Field]] = {
         "seconds": Field("number", "for each measurement, at most"),
         "speed": Field("number", "pace of end to end"),
         "look_ahead": Field("bool", "whether bin boundaries were prepared beforehand"),
+        "threads": Field("int", "that shared a large emission"),
         "interrupted": _INTERRUPTED,
         "models": Field("[object]", "what each model is"),
         "rows": Field("[object]", "percentiles in nanoseconds for each `model`, `emit` and `what`"),
