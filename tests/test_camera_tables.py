@@ -457,3 +457,42 @@ def test_packed_files_are_unpacked_for_the_while_and_damage_is_counted(tmp_path,
     path.write_bytes(packed[:3])
     with pytest.raises(InputError, match="nothing in it can be unpacked"):
         sf.open_recording(path)
+
+
+def lived(path, t):
+    """A recording of a table with these times, and what its clock did."""
+    rows = np.stack([t, np.arange(len(t)) % 16, np.arange(len(t)) % 12, np.arange(len(t)) % 2], axis=1)
+    np.save(path, rows)
+    with sf.open_recording(path) as recording:
+        n = sum(len(batch) for batch in recording)
+        return n, recording.duration_us, recording.first_us, dict(recording.counts)
+
+
+def test_a_clock_that_starts_anew_each_second_is_not_folded_into_one_second(tmp_path):
+    t = np.arange(20_000) * 1_000
+    assert lived(tmp_path / "a.npy", t % 1_000_000) == (20_000, 20 * 999_000, 0, {"restarts": 19})
+    t[12_000:] -= t[12_000]
+    assert lived(tmp_path / "b.npy", t) == (20_000, 11_999_000 + 7_999_000, 0, {"restarts": 1})
+
+
+@pytest.mark.parametrize("where", [1, 5_000, 8_191, 8_192, 8_193, 19_998])
+@pytest.mark.parametrize("absurd", [0, 10**13])
+def test_one_absurd_time_costs_its_event_alone(tmp_path, where, absurd):
+    t = 5_000_000 + np.arange(20_000) * 1_000
+    expected = lived(tmp_path / "whole.npy", np.delete(t, where))
+    assert expected == (19_999, 19_999_000, 5_000_000, {})
+    t[where] = absurd
+    n, duration_us, first_us, counts = lived(tmp_path / "a.npy", t)
+    assert (n, duration_us, first_us, counts) == (*expected[:3], {"stray events": 1})
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1, "microseconds"), (1_000, "nanoseconds")])
+def test_a_few_absurd_times_do_not_change_the_unit(tmp_path, factor, unit):
+    t = 5_000_000 + np.arange(20_000) * 1_000
+    t *= factor
+    t[[300, 7_000]] = 10**15, 0
+    np.save(tmp_path / "a.npy", np.stack([t, t % 16, t % 12, t % 2], axis=1))
+    options = TableOptions(columns="t,x,y,p")
+    assert any(
+        f"times are {unit}" in said for said in open_events(tmp_path / "a.npy", options=options).assumptions
+    )

@@ -228,7 +228,9 @@ def _check_falls(path: Path, table: Sequence[NDArray[Any]], order: Sequence[int]
 def _unit_of(t: NDArray[Any]) -> tuple[str, str]:
     """The unit of times, and why."""
     t = t[np.isfinite(t)] if t.dtype.kind == "f" else t
-    top = float(t.max(initial=0))
+    # A few absurd times say nothing of the others.
+    few = 0.01 if len(t) >= 2 * _LEAST_ROWS else 0.0
+    low, top = np.quantile(t, (few, 1 - few)).tolist() if len(t) else (0.0, 0.0)
     is_whole = bool((t == np.rint(t)).all())
     if is_whole and top >= 1e17:
         return "ns", "as whole numbers of this size they count from 1970"
@@ -238,7 +240,7 @@ def _unit_of(t: NDArray[Any]) -> tuple[str, str]:
         return "ms", "as numbers of this size with fractions they count from 1970"
     units = (("us", 1e6), ("ns", 1e9)) if is_whole else (("s", 1.0), ("ms", 1e3), ("us", 1e6))
     form = "they are whole numbers" if is_whole else "they have fractions"
-    span = top - float(t.min(initial=top))
+    span = (top - low) / (1 - 2 * few)
     if len(t) < _LEAST_ROWS or span <= 0:
         return units[0][0], form
     rates = [(unit, len(t) / span * ticks) for unit, ticks in units]

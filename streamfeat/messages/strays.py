@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from streamfeat.messages.codecs import EVT3_WRAP_US
 
-__all__ = ["BACK_US", "STEP_US", "false_wrap", "stray_events", "tail_apart"]
+__all__ = ["BACK_US", "FEW", "STEP_US", "false_wrap", "stray_events", "tail_apart"]
 
 BACK_US = 500_000
 """A fall of less than this is events out of order, of the same clock."""
 STEP_US = 1_000_000
 """Within a packet, and beyond twice the time that passed between packets, a larger step is suspicious."""
-_FEW = 8
+FEW = 8
 """Events apart from the others are strays if they are fewer than one in so many."""
 
 
@@ -36,7 +36,7 @@ def stray_events(t: NDArray[np.int64], before_us: int | None) -> NDArray[np.bool
         kept = np.flatnonzero(~strays)
         ahead, behind = _apart(t[kept], before_us)
         fewer = _less_likely(t[kept], ahead, behind)
-        if not fewer.any() or (np.count_nonzero(strays) + np.count_nonzero(fewer)) * _FEW > len(t):
+        if not fewer.any() or (np.count_nonzero(strays) + np.count_nonzero(fewer)) * FEW > len(t):
             break
         strays[kept[fewer]] = True
     return strays
@@ -70,7 +70,7 @@ def tail_apart(t: NDArray[np.int64]) -> int:
     if len(steps) == 0:
         return 0
     tail = len(t) - 1 - int(steps[-1])
-    return tail if tail * _FEW <= len(t) else 0
+    return tail if tail * FEW <= len(t) else 0
 
 
 def false_wrap(t: NDArray[np.int64], before_us: int | None, most: int) -> int | None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.camera_files.event_files import EventFile, open_events
 from streamfeat.camera_files.source import TableOptions
@@ -16,6 +17,7 @@ from streamfeat.events import Events
 from streamfeat.files.locations import Location, fetched
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import MAX_PIXELS, Label, Packet
+from streamfeat.messages.strays import BACK_US, FEW, stray_events
 from streamfeat.recordings.options import ReadOptions
 from streamfeat.recordings.records import Losses
 from streamfeat.recordings.sources import Part, Topic
@@ -77,9 +79,8 @@ class CameraSource:
             if self._label:
                 yield from self._labelled()
             for block in self._file.blocks():
-                for events in _cut(block):
-                    log_time_ns = int(events["t"][0]) * 1000
-                    yield 0, Packet(self._topic, events, self.resolution, log_time_ns, seq)
+                for first_us, events in _cut(block):
+                    yield 0, Packet(self._topic, events, self.resolution, first_us * 1000, seq)
                     seq += 1
         except InputError as error:
             if seq == 0:
@@ -115,12 +116,45 @@ def _label_in(labels: Sequence[str]) -> str:
     return named[0] if named else next(iter(found.values())) if len(found) == 1 else ""
 
 
-def _cut(block: Events) -> Iterator[Events]:
-    """A block in packets of at most 8192 events, whose times lie within a second of the first."""
-    start = 0
+def _cut(block: Events) -> Iterator[tuple[int, Events]]:
+    """A block in packets of at most 8192 events, each with the time that it begins at, microseconds.
+
+    The times of a packet lie within a second, and fall by less than half a second: what lies further is a gap
+    or a clock that starts anew. Few events of absurd times stay in the packet around them, whose timeline
+    leaves them out.
+    """
+    start, before_us = 0, None
     while start < len(block):
         packet = block[start : start + _PACKET_EVENTS]
-        far = np.flatnonzero(np.abs(packet["t"] - packet["t"][0]) >= _PACKET_US)
-        packet = packet[: far[0]] if len(far) else packet
-        yield packet
-        start += len(packet)
+        end, first_us, before_us = _one_packet(packet["t"], before_us)
+        yield first_us, packet[:end]
+        start += end
+
+
+def _one_packet(t: NDArray[np.int64], before_us: int | None) -> tuple[int, int, int]:
+    """How many of the first events belong together, and when they begin and end.
+
+    Args:
+        t: `(n,)` times, microseconds, n > 0.
+        before_us: when the packet before them ended, None if there is none.
+    """
+    if np.ptp(t) < BACK_US:
+        return len(t), int(t[0]), int(t.max())
+    around = t if before_us is None else np.concatenate([[before_us], t])
+    strays = stray_events(around, None)
+    # Where what came before, or the first event of all, is apart from what follows, the clock has moved.
+    kept = np.arange(len(t)) if strays[0] else np.flatnonzero(~strays[len(around) - len(t) :])
+    end = _end(t, kept)
+    if (end - np.searchsorted(kept, end)) * FEW > end:
+        kept = np.arange(len(t))
+        end = _end(t, kept)
+    within = t[kept[kept < end]]
+    return end, int(within[0]), int(within.max())
+
+
+def _end(t: NDArray[np.int64], kept: NDArray[np.intp]) -> int:
+    """Where the first packet ends. Strays behind it may begin what follows, and are left to it."""
+    times = t[kept]
+    fallen = times < np.maximum.accumulate(times) - BACK_US
+    breaks = np.flatnonzero(fallen | (np.abs(times - times[0]) >= _PACKET_US))
+    return int(kept[(breaks[0] if len(breaks) else len(kept)) - 1]) + 1
