@@ -496,3 +496,17 @@ def test_a_few_absurd_times_do_not_change_the_unit(tmp_path, factor, unit):
     assert any(
         f"times are {unit}" in said for said in open_events(tmp_path / "a.npy", options=options).assumptions
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("a.raw", bytes(100), r"no header says .*cat - a\.raw"),
+        ("a.raw", b"% evt 3.0\n% geometry 64x48\n% end\n", r"a\.raw: holds no events"),
+        ("a.npy", b"\x93NUMPY\x01\x00", "copy it again"),
+    ],
+)
+def test_what_cannot_be_read_says_what_to_do(tmp_path, name, data, said):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=said):
+        sf.open_recording(tmp_path / name)

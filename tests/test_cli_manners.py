@@ -13,6 +13,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from streamfeat import cli
+from streamfeat.cli import program
 from streamfeat.cli.program import completing
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
@@ -118,3 +119,8 @@ def test_a_tiny_model_is_refused_by_a_classifier_of_another(run, tmp_path):
     )
     assert result.status == 2
     assert "digits_classifier.safetensors: expects" in result.err
+
+
+def test_a_long_name_above_a_short_table_is_not_broken_into_its_width(capsys):
+    program.print_result({"labels": 0}, "a_recording_with_a_long_name.mcap", as_json=False)
+    assert capsys.readouterr().out.splitlines()[0] == "a_recording_with_a_long_name.mcap"

@@ -137,6 +137,13 @@ def test_people_see_what_says_something():
     ]
 
 
+def test_a_camera_file_has_a_format_and_no_messages():
+    topics = [{"name": "/events", "schema": "evt3", "schema_encoding": "", "messages": 0}]
+    assert for_people({"topics": topics}, RESULTS["info"]) == [("topics", "/events (evt3)")]
+    topics[0] |= {"schema": "dvs_msgs/msg/EventArray", "schema_encoding": "ros2msg"}
+    assert for_people({"topics": topics}, RESULTS["info"])[0][1].endswith("EventArray, 0 messages)")
+
+
 def test_every_command_with_json_has_its_fields_on_the_page():
     with_json = {
         command.callback.__name__

@@ -272,7 +272,9 @@ def test_a_label_that_cannot_be_is_refused_alone(bad):
 
 def test_a_label_far_ahead_is_warned_of():
     job = Listening()
-    job.take(packet("cam/a/events"), label("cam/a/label", 59 * SECOND_NS))
+    job.take(packet("cam/a/events"), label("cam/a/label", 2 * SECOND_NS))  # the next sample of a data set
+    assert job.warnings.counts == {}
+    job.take(label("cam/a/label", 59 * SECOND_NS))
     assert job.warnings.counts == {"label ahead": 1}
     job.take(label("cam/a/label", 62 * SECOND_NS))
     assert job.warnings.counts == {"label ahead": 1, "bad label": 1}

@@ -21,6 +21,7 @@ from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, La
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, make_decoder
 from streamfeat.messages.packets import PacketWriter
 from streamfeat.recordings import records as mcap_records
+from streamfeat.recordings.options import ReadOptions
 from streamfeat.recordings.reader import WHOLE, Label, Packet, Topic, open_recording
 from streamfeat.recordings.samples import complete_samples
 from streamfeat.recordings.writer import RecordingWriter, recover
@@ -694,3 +695,14 @@ def test_a_chunk_inside_a_good_chunk_is_not_found_when_what_comes_after_is_damag
     assert list(map(bytes, found)) == messages
     assert losses.counts == {"damaged record": 1}
     assert losses.bytes == {"damaged record": second[0] - first[1]}
+
+
+def test_options_of_tables_are_checked_and_said_to_be_of_no_use_for_messages(tmp_path):
+    path = write_messages(tmp_path / "a.mcap", packet())
+    with open_recording(path, options=ReadOptions(resolution=(5, 5))) as recording:
+        assert ["the options for them change nothing" in line for line in recording.assumptions] == [True]
+    with open_recording(path) as recording:
+        assert recording.assumptions == []
+    for wrong in ({"time_unit": "fortnight"}, {"columns": "a,b"}):
+        with pytest.raises(InputError, match=r"--(time-unit|columns)"):
+            open_recording(path, options=ReadOptions(**wrong))

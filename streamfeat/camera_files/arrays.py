@@ -43,7 +43,10 @@ def open_numpy(path: Path, head: bytes, options: TableOptions) -> Contents:
     except InputError:
         raise
     except Exception as error:  # zip, zlib and header parsers raise a dozen unrelated types on damage
-        raise InputError(f"{path}: not a readable NumPy file without pickles: {one_line(error)}") from error
+        raise InputError(
+            f"{path}: not a readable NumPy file without pickles ({one_line(error)}); copy it again if it is "
+            "cut short, or save plain arrays of numbers"
+        ) from error
     tables, others = _tables(loaded)
     if not tables:
         fields, _ = named_fields([*loaded])

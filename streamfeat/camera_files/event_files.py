@@ -261,6 +261,11 @@ def _find_format(path: Path, head: bytes) -> str:
         return "aedat1"
     if _TEXT.fullmatch(head[:1000]):
         return "text"
+    if ending == ".raw":
+        raise InputError(
+            f"{path}: not a known event file: no header says how its events are encoded; if you know it, "
+            f"put one in front: printf '%% evt 3.0\\n' | cat - {path.name} > with_header.raw"
+        )
     raise InputError(f"{path}: not a known event file; known are {'; '.join(FORMATS.values())}")
 
 

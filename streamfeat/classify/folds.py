@@ -98,7 +98,7 @@ def assign_folds(
     if len(counts) and counts.min() < n:
         raise InputError(
             f"label {str(names[counts.argmin()])!r} has {counts.min()} training samples, "
-            f"{n}-fold cross-validation needs {n}; add samples or lower the folds"
+            f"{n}-fold cross-validation needs {n}; add samples or lower --folds"
         )
     if groups == "block":
         return block_numbers(labels, sources, n)
@@ -127,7 +127,7 @@ def _shuffled(
         return [test for _, test in splitter.split(targets, targets)]
     if (n_sources := len(np.unique(sources))) < n:
         raise InputError(
-            f"the samples are of {n_sources} source(s), too few for {n} folds; lower the folds, or give "
+            f"the samples are of {n_sources} source(s), too few for {n} folds; lower --folds, or give "
             "--groups block or --groups none"
         )
     grouped = StratifiedGroupKFold(n, shuffle=True, random_state=seed)

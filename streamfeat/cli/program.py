@@ -337,7 +337,9 @@ def print_result(result: dict[str, Any], title: str, *, as_json: bool, command: 
     if as_json:
         print_json(command, result)
         return
-    table = Table(title=title, show_header=False, title_justify="left", box=None, pad_edge=False)
+    # Above the table and not its title, which would be wrapped at the width of the columns.
+    out.print(Text(title, style="table.title", overflow="fold"))
+    table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")  # or a long path would lose its end in a narrow terminal
     for name, text in for_people(result, RESULTS.get(command, {})):

@@ -346,7 +346,9 @@ def _text(name: str, value: Any) -> str:
     if name == "resolution":
         return f"{value[1]}x{value[0]}"
     if isinstance(value, Mapping) and "schema" in value:
-        return f"{value['name']} ({value['schema']}, {value['messages']:,} messages)"
+        # A camera file has a format instead, and no messages.
+        count = f", {value['messages']:,} messages" if value["messages"] or value["schema_encoding"] else ""
+        return f"{value['name']} ({value['schema']}{count})"
     if name == "objective":
         return f"{value[0]:.6g} to {value[-1]:.6g}"
     if isinstance(value, bool):

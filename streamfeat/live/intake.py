@@ -35,8 +35,9 @@ __all__ = ["Intake"]
 
 _MAX_SPAN_US = 60_000_000
 """A label further than this from its stream is refused."""
-_AHEAD_US = 1_000_000
-"""Of a label further ahead than this there is a warning: events before it are late."""
+_AHEAD_US = 5_000_000
+"""Of a label further ahead than this there is a warning: events before it are late. Samples of a data set are
+a second apart, and each label comes before its sample."""
 _POLL_S = 0.02
 _IDLE_S = 0.25
 _FORGOTTEN_NS = 60_000_000_000

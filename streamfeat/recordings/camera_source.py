@@ -64,7 +64,10 @@ class CameraSource:
         height, width = self.resolution
         if height * width > MAX_PIXELS:
             self.close()
-            raise InputError(f"{path}: a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read")
+            raise InputError(
+                f"{path}: a sensor of {width}x{height} pixels; at most {MAX_PIXELS} are read; if single "
+                "events lie far outside the sensor, --resolution WxH sets its size"
+            )
         streams = self._file.streams
         self._topic = stream or (streams[0] if len(streams) == 1 else _TOPIC)
         self.topics = [Topic(self._topic, self._file.format, "", 0, is_events=True)]

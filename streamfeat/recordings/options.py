@@ -6,6 +6,7 @@ Not here: what becomes of them (`opening`, `labels`, `streamfeat.denoise`).
 
 from dataclasses import dataclass, field
 
+from streamfeat.camera_files.source import TableOptions
 from streamfeat.denoise.stage import Denoising
 from streamfeat.events import Resolution
 
@@ -22,6 +23,9 @@ class ReadOptions:
         resolution: `(height, width)` of a camera file, instead of what it says.
         labels: a label file, or a topic of texts, see `streamfeat.recordings.labels`.
         denoising: noise that is taken out before anything else looks at the events.
+
+    Raises:
+        InputError: columns, unit or resolution cannot be used.
     """
 
     columns: str | None = None
@@ -29,6 +33,10 @@ class ReadOptions:
     resolution: Resolution | None = None
     labels: str | None = None
     denoising: Denoising = field(default_factory=Denoising)
+
+    def __post_init__(self) -> None:
+        """Check what is for tables, whether or not there will be one."""
+        TableOptions(self.columns, self.time_unit, self.resolution)
 
 
 AS_IT_IS = ReadOptions()

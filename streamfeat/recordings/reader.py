@@ -116,6 +116,12 @@ class Recording(Shown):
             self._labels = labels_for(self._source, options.labels, self.topic)
             if self._labels and self._labels.assumption:
                 self.assumptions.append(self._labels.assumption)
+            about_tables = (options.columns, options.time_unit, options.resolution)
+            if any(about_tables) and not any(topic.is_events for topic in self.topics):
+                self.assumptions.append(
+                    f"{self.path}: its messages say columns, unit and resolution; "
+                    "the options for them change nothing"
+                )
             self.encoding = ""
             self._timeline = Timeline(self.topic)
             self.resolution = self._first_packet().resolution
@@ -361,6 +367,8 @@ class Recording(Shown):
             if isinstance(item, Packet):
                 return item
         reasons = list(self.losses.first.values()) or ["it has no messages"]
+        if not self.losses and any(topic.is_events for topic in self.topics):
+            raise InputError(f"{self.path}: holds no events")
         raise InputError(f"{self.path}: nothing can be read from topic {self.topic!r}: {reasons[0]}")
 
 

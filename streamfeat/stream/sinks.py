@@ -236,7 +236,7 @@ class TerminalSink:
     def close(self, *, failed: bool) -> None:
         """Say how many samples were not shown."""
         if self._skipped:
-            self._console.print(f"[dim]... and {self._skipped} samples more than a reader could follow[/]")
+            self._console.print(f"[dim]... and {self._skipped} samples more, too fast to show[/]")
 
     def _line(self, e: Emission) -> Text:
         line = Text(no_wrap=True, overflow="crop")
