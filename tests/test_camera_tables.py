@@ -505,6 +505,7 @@ def test_a_few_absurd_times_do_not_change_the_unit(tmp_path, factor, unit):
         ("a.raw", b"% evt 3.0\n% geometry 64x48\n% end\n", r"a\.raw: holds no events"),
         ("a.npy", b"\x93NUMPY\x01\x00", "copy it again"),
     ],
+    ids=["no header", "no events", "cut short"],
 )
 def test_what_cannot_be_read_says_what_to_do(tmp_path, name, data, said):
     (tmp_path / name).write_bytes(data)

@@ -187,3 +187,14 @@ def test_a_camera_that_was_silent_for_hours_has_not_jumped():
     clock, hour = CameraClock(), 3_600_000_000
     clock.place(0, 1_000, 0)
     assert clock.place(5 * hour, 5 * hour, 5 * hour * 1000).event == ""
+
+
+def test_the_very_first_packets_may_come_in_another_order_too():
+    delivery = Delivery()
+    marks = {6: 60, 5: 50, 7: 70}
+    seen = [delivery.see(b"", seq, 0, mark=marks[seq], stamp_ns=seq) for seq in (6, 5, 7, 5, 6)]
+    assert [verdict.use for verdict in seen] == [True, True, True, False, False]
+    assert (seen[1].late, seen[1].lost) == (True, 0)
+    stats = delivery.stats
+    assert (stats.reordered, stats.duplicates, stats.lost, stats.restarts) == (1, 2, 0, 0)
+    assert not delivery.see(b"", 2, 0, mark=20, stamp_ns=2).use  # too old to be of the beginning

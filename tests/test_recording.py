@@ -706,3 +706,11 @@ def test_options_of_tables_are_checked_and_said_to_be_of_no_use_for_messages(tmp
     for wrong in ({"time_unit": "fortnight"}, {"columns": "a,b"}):
         with pytest.raises(InputError, match=r"--(time-unit|columns)"):
             open_recording(path, options=ReadOptions(**wrong))
+
+
+def test_a_second_recording_behind_the_first_is_not_passed_over_in_silence(tmp_path):
+    data = write_messages(tmp_path / "a.mcap", packet()).read_bytes()
+    for behind, lost in ((b"", {}), (data, {"second recording": 1})):
+        (tmp_path / "b.mcap").write_bytes(data + behind)
+        with open_recording(tmp_path / "b.mcap") as recording:
+            assert (recording.n_events, dict(recording.losses.counts)) == (1, lost)

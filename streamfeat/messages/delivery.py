@@ -107,6 +107,7 @@ class Delivery:
         self._has_come = False
         self._have_left = False
         self._next = 0
+        self._began: int | None = None
         self._missing: dict[int, None] = {}
         self._old: list[int] = []
         self._marks: dict[int, int] = {}
@@ -164,7 +165,7 @@ class Delivery:
         self._have_left &= not self._is_announced
         gap = seq - self._next
         if gap < 0:
-            return self._see_old(seq, dropped)
+            return self._see_old(seq, dropped, is_first_come=self._is_before_the_first(seq, mark))
         self._old.clear()
         self._next = seq + 1
         self.stats.received += 1
@@ -237,6 +238,7 @@ class Delivery:
         self._have_left &= not self._is_announced and (first or self._has_come)
         self._has_come = False
         self._gid, self._heard_ns, self._next = gid, now_ns, seq + 1
+        self._began = seq if first else None
         self._missing.clear()
         self._marks.clear()
         self._old.clear()
@@ -254,12 +256,18 @@ class Delivery:
             unheard=unheard,
         )
 
-    def _see_old(self, seq: int, dropped: int) -> Verdict:
-        if seq not in self._missing:
+    def _is_before_the_first(self, seq: int, mark: int | None) -> bool:
+        """Whether it should have come right before the very first packet, and has not come yet."""
+        is_new = mark is not None and seq not in self._marks
+        return is_new and self._began is not None and 0 < self._began - seq < _OLD_IN_A_ROW
+
+    def _see_old(self, seq: int, dropped: int, *, is_first_come: bool) -> Verdict:
+        if seq in self._missing:
+            del self._missing[seq]
+            self.stats.lost -= 1
+        elif not is_first_come:
             self.stats.duplicates += 1
             return Verdict(use=False, lost=dropped)
-        del self._missing[seq]
-        self.stats.lost -= 1
         self.stats.reordered += 1
         self.stats.received += 1
         return Verdict(use=True, lost=dropped, broken=True, late=True)

@@ -175,6 +175,8 @@ def iter_records(
         opcode, length = _FRAME.unpack_from(head)
         after = at + _FRAME.size + length
         if _ENDS.get(opcode) == length:
+            if more := _find_chunk(file, after, size):
+                losses.add("second recording", size - more, f"byte {more}: chunks of another file follow")
             return
         wrong = after > size or not _is_record(opcode, length, head)
         if wrong or (opcode == Opcode.HEADER and _swallows_a_chunk(file, at, after, size)):
