@@ -6,6 +6,7 @@ import random
 import struct
 import tracemalloc
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -714,3 +715,12 @@ def test_a_second_recording_behind_the_first_is_not_passed_over_in_silence(tmp_p
         (tmp_path / "b.mcap").write_bytes(data + behind)
         with open_recording(tmp_path / "b.mcap") as recording:
             assert (recording.n_events, dict(recording.losses.counts)) == (1, lost)
+
+
+def test_events_outside_the_sensor_are_counted_before_any_replay(tmp_path):
+    events = make_events([1, 70, 70], [1, 50, 2], [1, 0, 1], [10, 20, 30])
+    (message,) = PacketWriter("mono").messages(events, (60, 80))
+    for sides, outside in (((60, 80), 0), ((20, 80), 1), ((60, 70), 2)):
+        data = replace(message, height=sides[0], width=sides[1]).to_cdr()
+        with open_recording(write_messages(tmp_path / "a.mcap", data)) as recording:
+            assert (recording.n_events, recording.n_outside) == (3, outside)

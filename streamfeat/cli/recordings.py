@@ -81,6 +81,7 @@ def info(
             "events": n_events,
             "on": rec.n_on,
             "off": rec.n_off,
+            "rejected": rec.n_outside,
             "first_us": rec.first_us,
             "duration_s": rec.duration_us / 1e6,
             "events_per_s": round(n_events / max(rec.duration_us / 1e6, 1e-6)),

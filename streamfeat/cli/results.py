@@ -80,6 +80,9 @@ RESULTS: dict[str, dict[str, Field]] = {
         "events": Field("int", "events that can be used"),
         "on": Field("int", "ON events", "ON"),
         "off": Field("int", "OFF events", "OFF"),
+        "rejected": Field(
+            "int", "those of them that lie outside the resolution, and change nothing", quiet=True
+        ),
         "first_us": Field(
             "int?", "stream time of the earliest event; null without events", "first event, us"
         ),

@@ -340,6 +340,11 @@ class Recording(Shown):
         return self.n_on + self.n_off
 
     @property
+    def n_outside(self) -> int:
+        """Number of events outside the resolution of their packet, which an engine rejects."""
+        return self._totals.n_outside
+
+    @property
     def digest(self) -> str:
         """SHA-256, hexadecimal, of all events that are used, in their order: 13 bytes each, little-endian.
 

@@ -23,6 +23,7 @@ class Totals:
     labels: list[Label] = field(default_factory=list)
     n_on: int = 0
     n_off: int = 0
+    n_outside: int = 0
     first_us: int | None = None
     last_us: int | None = None
     hash: "hashlib._Hash" = field(default_factory=hashlib.sha256)
@@ -47,6 +48,8 @@ class Totals:
         on = int(np.count_nonzero(events["p"]))
         self.n_on += on
         self.n_off += len(events) - on
+        height, width = packet.resolution
+        self.n_outside += int(np.count_nonzero((events["x"] >= width) | (events["y"] >= height)))
         first, last = int(events["t"].min()), int(events["t"].max())
         if packet.epoch != self._epoch:
             self._before_us, self._span, self._epoch = self.duration_us, None, packet.epoch
