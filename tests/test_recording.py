@@ -724,3 +724,30 @@ def test_events_outside_the_sensor_are_counted_before_any_replay(tmp_path):
         data = replace(message, height=sides[0], width=sides[1]).to_cdr()
         with open_recording(write_messages(tmp_path / "a.mcap", data)) as recording:
             assert (recording.n_events, recording.n_outside) == (3, outside)
+
+
+@pytest.mark.parametrize("encoding", ["mono", "libcaer", "libcaer_cmp"])
+def test_a_clock_that_starts_anew_is_written_so_that_it_is_read_so(tmp_path, encoding):
+    runs = [make_events(np.arange(900) % 80, np.arange(900) % 60, np.arange(900) % 2, t) for t in (
+        5_000_000 + np.arange(900) * 1_000,
+        1_000 + np.arange(900) * 1_100,
+        2_000 + np.arange(900) * 900,
+    )]  # fmt: skip
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, encoding=encoding) as writer:
+        for i, run in enumerate(runs):
+            writer.write_label(Label(int(run["t"][0]), 100_000, f"run {i}"))
+            for batch in np.array_split(run, 9):
+                writer.write_events(batch, (60, 80))
+    with open_recording(path) as recording:
+        items = [item for item in recording.items() if isinstance(item, Label) or len(item.events)]
+        assert recording.counts == {"restarts": 2}
+    events = np.concatenate([item.events for item in items if isinstance(item, Packet)])
+    np.testing.assert_array_equal(events, np.concatenate(runs))
+    is_label = [isinstance(item, Label) for item in items]
+    n_packets = len(items) - 3
+    assert [i for i, label in enumerate(is_label) if label] == [
+        0,
+        n_packets // 3 + 1,
+        2 * (n_packets // 3) + 2,
+    ]

@@ -24,6 +24,7 @@ from streamfeat.files.locations import StoreLocation, location_of
 from streamfeat.files.outputs import OutputFile
 from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, LabelMessage, PredictionMessage
 from streamfeat.messages.packets import Label, PacketWriter
+from streamfeat.messages.strays import BACK_US
 from streamfeat.recordings.records import Losses, count_missing, iter_messages, open_mcap, read_summary
 
 __all__ = ["RecordingWriter", "recover"]
@@ -127,6 +128,8 @@ class RecordingWriter:
         self._packets = PacketWriter(encoding, frame_id)
         self._channels: dict[str | int, int] = {}
         self._schemas: dict[int, int] = {}
+        self._reached_us: int | None = None
+        self._ahead_us = 0
         self._check_target()
         self._output = OutputFile(self.path, suffix=part_suffix, keep_leftover=True)
         self._writer = Writer(self._output.file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
@@ -178,6 +181,9 @@ class RecordingWriter:
     def write_events(self, events: Events, resolution: Resolution) -> None:
         """Write a batch as one or more packets, each at the time of its first event.
 
+        Where a batch begins half a second or more before what was written, the camera's clock has started
+        anew: log time goes on, so that what is read back is in this order and the restart is seen.
+
         Args:
             events: `(n,)` array of `EVENT_DTYPE`, not changed, or a structured array of another tool (see
                 `as_events`); n may be 0, which writes nothing.
@@ -187,8 +193,17 @@ class RecordingWriter:
             InputError: the encoding cannot represent the events (see `codecs.encode`), or a
                 time is negative or 2^31 s or more.
         """
-        for packet in self._packets.messages(as_events(events), resolution):
-            self._write(self._event_topic, packet)
+        events = as_events(events)
+        if len(events):
+            first_us, last_us = int(events["t"].min()), int(events["t"].max())
+            if self._is_anew(first_us):
+                self._ahead_us = (self._reached_us or 0) - first_us
+            self._reached_us = max(self._reached_us or 0, last_us + self._ahead_us)
+        for packet in self._packets.messages(events, resolution):
+            self._write(self._event_topic, packet, packet.stamp_ns + self._ahead_us * 1000)
+
+    def _is_anew(self, first_us: int) -> bool:
+        return self._reached_us is not None and first_us + self._ahead_us < self._reached_us - BACK_US
 
     def write_label(self, label: Label, topic: str = "/label") -> None:
         """Write a label; do so before the events it speaks of.
@@ -204,7 +219,9 @@ class RecordingWriter:
             label.split,
             label.source,
         )
-        self._write(topic, message)
+        anew = self._is_anew(label.start_us)  # right before the first packet of a clock it belongs to that
+        log_us = (self._reached_us or 0) if anew else label.start_us + self._ahead_us
+        self._write(topic, message, log_us * 1000)
 
     def write_features(
         self, t_us: int, n_events: int, data: ArrayLike, *, incomplete: bool = False, topic: str = "/features"
@@ -256,9 +273,10 @@ class RecordingWriter:
         """
         self._add(self._channel(topic, kind), log_time_ns, data, log_time_ns, sequence)
 
-    def _write(self, topic: str, message: _Message) -> None:
+    def _write(self, topic: str, message: _Message, log_time_ns: int | None = None) -> None:
         data = message.to_cdr()
-        self._add(self._channel(topic, type(message)), message.stamp_ns, data, message.stamp_ns, 0)
+        log_time_ns = message.stamp_ns if log_time_ns is None else log_time_ns
+        self._add(self._channel(topic, type(message)), log_time_ns, data, message.stamp_ns, 0)
 
     def _channel(self, topic: str, kind: type[_Message | EventArray]) -> int:
         which = f"{topic} {kind.SCHEMA_NAME}"
