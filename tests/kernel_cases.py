@@ -885,6 +885,8 @@ GATHER_VOLUME = {
     "all entries": lambda call: call.end == len(call.values),
     "none": lambda call: call.end == 0,
     "an end within a bin": lambda call: call.end % _line(call) > 0,
+    "lines that are copied entry by entry": lambda call: call.patch < 8 and call.start < call.end,
+    "lines of vectors that overlap": lambda call: call.patch > 8 and call.start < call.end,
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
 
