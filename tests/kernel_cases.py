@@ -118,6 +118,57 @@ MONO = {
 }
 
 
+TURNS_BETWEEN = {
+    "nothing before": lambda call: call.before < 0,
+    "a fall of half the range": lambda call: (
+        call.before >= 0 and call.now - call.before == -(2**call.bits) // 2
+    ),
+    "a fall of more": lambda call: call.result == 1,
+    "a rise of half the range": lambda call: call.before >= 0 and call.now - call.before == 2**call.bits // 2,
+    "a rise of more": lambda call: call.result == -1,
+}
+
+
+def _evt2_steps(call):
+    """Each word, with the state before it."""
+    state, out = call.state.copy(), call.out.copy()
+    for i, word in enumerate(call.words.tolist()):
+        high, turns = state.tolist()
+        yield SimpleNamespace(kind=word >> 28, low=word % 2**28, high=high, turns=turns)
+        naive.decode_evt2(call.words[i : i + 1], state, out)
+
+
+EVT2 = {
+    "OFF": lambda s: s.kind == 0 and s.high >= 0,
+    "ON": lambda s: s.kind == 1 and s.high >= 0,
+    "an event before there is a time": lambda s: s.kind <= 1 and s.high < 0,
+    "the first time": lambda s: s.kind == 8 and s.high < 0,
+    "a turn": lambda s: s.kind == 8 and s.low - s.high < -(2**27) and s.high >= 0,
+    "an event after a turn": lambda s: s.kind <= 1 and s.turns > 0,
+    "an event from before the first turn": lambda s: s.kind <= 1 and s.turns < 0 and s.high >= 0,
+    "a word that carries no event": lambda s: s.kind in (10, 14),
+}
+
+
+def _dat_steps(call):
+    """Each record, with the state before it."""
+    state, out = call.state.copy(), call.out.copy()
+    for i, (t, word) in enumerate(call.records.tolist()):
+        latest, turns = state.tolist()
+        yield SimpleNamespace(t=t, word=word, latest=latest, turns=turns)
+        naive.decode_dat(call.records[i : i + 1], state, out)
+
+
+DAT = {
+    "the first": lambda s: s.latest < 0,
+    "ON": lambda s: s.word >> 28 > 1,
+    "OFF": lambda s: s.word >> 28 == 0,
+    "a turn": lambda s: s.latest >= 0 and s.t - s.latest < -(2**31),
+    "goes on after a turn": lambda s: s.turns > 0 and 0 <= s.t - s.latest < 2**31,
+    "from before the first turn": lambda s: s.turns < 0,
+}
+
+
 def _stream_kinds(call):
     """The first byte of each item of an Event Stream, as far as they are whole."""
     at, firsts = 0, []
@@ -959,6 +1010,9 @@ CASES = {
     "decode_evt3": {"no word": lambda call: len(call.words) == 0},
     "decode_libcaer_cmp": LIBCAER_CMP,
     "decode_mono": MONO,
+    "turns_between": TURNS_BETWEEN,
+    "decode_evt2": {"no word": lambda call: len(call.words) == 0},
+    "decode_dat": {"no record": lambda call: len(call.records) == 0},
     "decode_event_stream": EVENT_STREAM,
     "decode_ecf": ECF,
     "decode_groups": GROUPS,
@@ -1000,6 +1054,8 @@ CASES = {
 
 STEPS = {
     "decode_evt3": (_evt3_steps, EVT3),
+    "decode_evt2": (_evt2_steps, EVT2),
+    "decode_dat": (_dat_steps, DAT),
     "mark_noise": (_noise_steps, NOISE),
     "count_events": (_count_steps, COUNT_EVENTS),
 }

@@ -527,6 +527,37 @@ def make_time_span(rng):
     return events, int(rng.integers(1, 12)), int(rng.integers(1, 12)), np.array([7, 7])
 
 
+def _counts(rng, n, bits):
+    """Counts that go on a little, and now and then by about half of their range or more."""
+    half = 2 ** (bits - 1)
+    steps = rng.choice([0, 1, 700, -5, half - 1, half, half + 1, -half, -half - 1, 2 * half - 9], n)
+    return (int(rng.choice([0, 5, half, 2 * half - 1])) + np.cumsum(steps)) % 2**bits
+
+
+def make_turns_between(rng):
+    bits = int(pick(rng, [28, 32]))
+    before, now = (int(count) for count in _counts(rng, 2, bits))
+    return -1 if rng.random() < 0.1 else before, now, bits
+
+
+def make_evt2(rng):
+    n = random_length(rng, 60)
+    words = rng.integers(0, 2**28, n, np.uint32) | rng.choice([0, 1, 8, 10, 14], n).astype(np.uint32) << 28
+    is_high = words >> 28 == 8
+    words[is_high] = 8 << 28 | _counts(rng, np.count_nonzero(is_high), 28)
+    state = np.array([-1, 0] if rng.random() < 0.3 else [rng.integers(0, 2**28), rng.integers(-2, 3)])
+    return words, state, np.zeros(n, EVENT_DTYPE)
+
+
+def make_dat(rng):
+    n = random_length(rng, 40)
+    records = rng.integers(0, 2**32, (n, 2), np.uint32)
+    records[:, 0] = _counts(rng, n, 32)
+    records[:, 1] &= rng.choice([0x0FFFFFFF, 0xFFFFFFFF], n).astype(np.uint32)
+    state = np.array([-1, 0] if rng.random() < 0.3 else [rng.integers(0, 2**32), rng.integers(-2, 3)])
+    return records, state, np.zeros(n, EVENT_DTYPE)
+
+
 def make_event_stream(rng):
     data = rng.integers(0, 256, int(rng.integers(0, 80)), np.uint8)
     data[rng.random(len(data)) < 0.3] |= 0xFC
@@ -1183,6 +1214,9 @@ KERNELS = [
     Row(decode.decode_mono, make_mono),
     Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
+    Row(file_codes.turns_between, make_turns_between),
+    Row(file_codes.decode_evt2, make_evt2),
+    Row(file_codes.decode_dat, make_dat),
     Row(file_codes.decode_event_stream, make_event_stream),
     Row(file_codes.decode_ecf, make_ecf, exact_unless_refused),
     Row(file_codes.decode_groups, make_groups, exact_unless_refused),

@@ -106,6 +106,36 @@ def time_span(events, height, width, span):
 # streamfeat.kernels.file_codes
 
 
+def turns_between(before, now, bits):
+    if before < 0 or abs(now - before) <= 2**bits / 2:
+        return 0
+    return 1 if now < before else -1
+
+
+def decode_evt2(words, state, out):
+    high, turns = (int(v) for v in state)
+    events = []
+    for word in words.tolist():
+        kind, rest = divmod(word, 2**28)
+        if kind == 8:
+            turns += turns_between(high, rest, 28)
+            high = rest
+        elif kind in (0, 1) and high != -1:
+            time = (max(turns, 0) * 2**28 + high) * 64 + rest // 2**22
+            events.append((rest // 2**11 % 2**11, rest % 2**11, kind, time))
+    state[:] = high, turns
+    return _write(events, out)
+
+
+def decode_dat(records, state, out):
+    before, turns = (int(v) for v in state)
+    for i, (t, word) in enumerate(records.tolist()):
+        turns += turns_between(before, t, 32)
+        before = t
+        out[i] = word % 2**14, word // 2**14 % 2**14, min(word // 2**28, 1), t + max(turns, 0) * 2**32
+    state[:] = before, turns
+
+
 def decode_event_stream(data, is_atis, state, out):
     t, crossings, _ = (int(v) for v in state)
     data, at, events = data.tolist(), 0, []

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from streamfeat.camera_files import containers
 from streamfeat.camera_files.event_files import FORMATS, open_events, read_events
 from streamfeat.camera_files.prophesee import Unwrapped
 from streamfeat.errors import InputError
@@ -344,6 +345,44 @@ class TestHdf5:
             )
         with pytest.raises(InputError, match=r"filter 32463 .*which is not installed; pip install"):
             read_events(tmp_path / "a.h5")
+
+    def test_one_process_opens_a_file_and_reads_it(self, tmp_path, h5py, monkeypatch):
+        begun = []
+        start = containers.subprocess.Popen
+        monkeypatch.setattr(
+            containers.subprocess, "Popen", lambda *a, **k: begun.append(start(*a, **k)) or begun[-1]
+        )
+        events = make_events(np.arange(700_000) % 300, 5, 1, np.arange(700_000))
+        paths = [tmp_path / f"{i}.h5" for i in range(6)]
+        for path in paths:
+            with h5py.File(path, "w") as root:
+                root.create_dataset("CD/events", data=events, chunks=(100_000,), compression=1)
+        opened = open_events(paths[0])
+        for _ in range(3):
+            next(iter(opened))
+        np.testing.assert_array_equal(np.concatenate([*opened]), events)
+        assert len(begun) == 1
+        # Read again it begins again, as do those of many files that are open at a time.
+        assert sum(map(len, opened)) == len(events)
+        assert len(begun) == 2
+        many = [open_events(path) for path in paths]
+        assert sum(process.poll() is None for process in begun) == 4
+        for file in many:
+            assert sum(map(len, file)) == len(events)
+        assert len(begun) == 2 + 6 + 2
+        assert all(process.poll() is not None for process in begun)
+
+    def test_chunks_are_read_whole(self, tmp_path, h5py):
+        events = make_events(np.arange(700_000) % 300, 5, 1, np.arange(700_000))
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            root.create_dataset("CD/events", data=events, chunks=(300_000,))
+        assert [len(batch) for batch in open_events(tmp_path / "a.h5")] == [300_000, 300_000, 100_000]
+
+    def test_a_codec_of_hdf5plugin(self, tmp_path, h5py):
+        hdf5plugin = pytest.importorskip("hdf5plugin")
+        with h5py.File(tmp_path / "a.h5", "w") as root:
+            root.create_dataset("CD/events", data=EVENTS, chunks=(4,), **hdf5plugin.Blosc())
+        np.testing.assert_array_equal(read_events(tmp_path / "a.h5").events, EVENTS)
 
     def test_damage_and_foreign_layouts(self, tmp_path, h5py):
         with h5py.File(tmp_path / "a.h5", "w") as root:

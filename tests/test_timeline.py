@@ -16,6 +16,7 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
 from streamfeat.learn.volumes import windows_of
 from streamfeat.messages.cdr import EventArray, EventPacket
+from streamfeat.messages.clock import CameraClock
 from streamfeat.messages.codecs import encode
 from streamfeat.messages.packets import Label, Packet
 from streamfeat.messages.timeline import Timeline
@@ -530,3 +531,40 @@ class TestInfoOfSeveral:
         assert said.status == 2
         assert "no topic carries events" in said.err
         assert "the file ends at byte 5000" in said.err
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 1, 900, 999_999, 1_000_000, 1_000_001, -1, -400_000, -600_000, 70_000_000]),
+            st.sampled_from([0, 1, 500, 1_000_000, 1_000_001, 3_000_000]),
+            st.sampled_from([0, 1, 1, 1, 2, -1, -900_000]),
+            st.sampled_from([0, 1_000, 2_000_000]),
+        ),
+        max_size=12,
+    )
+)
+def test_a_packet_that_goes_on_is_placed_as_every_other(steps):
+    """The short way and the long one give the same, whatever the times and numbers are."""
+    short, long = Timeline("/events"), Timeline("/events")
+    quick = _played(short, steps)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(CameraClock, "goes_on", lambda *args: False)
+        slow = _played(long, steps)
+    assert quick == slow
+    assert short.counts == long.counts
+    assert short.snapshot(0) == long.snapshot(0)
+
+
+def _played(timeline, steps):
+    """What comes of packets of ten events, from steps of: first time, last time, number, and log time."""
+    t_us, seq, log_ns, out = 10_000_000, 5, HOST_NS, []
+    for first, span, number, passed_us in steps:
+        t_us, seq, log_ns = max(t_us + first, 0), max(seq + number, 0), log_ns + passed_us * 1000
+        payload, base_ns = encode(make_events(np.arange(10), 3, 1, [t_us] * 9 + [t_us + span]), "mono")
+        packet = EventPacket(log_ns, "cam", HEIGHT, WIDTH, seq, base_ns, "mono", False, payload)
+        out += timeline.message(EventPacket.SCHEMA_NAME, packet.to_cdr(), log_ns, seq)
+        t_us += span
+    out += timeline.finish()
+    return [(p.seq, p.log_time_ns, p.lost, p.epoch, p.until_us, p.events.tolist()) for p in out]

@@ -10,13 +10,16 @@ has none, and evlib 0.13.2 fails on three of four files whose chunks Prophesee's
 """
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,56 +40,127 @@ class _DamageError(Exception):
     """The file, or what the library makes of it."""
 
 
+@dataclass(slots=True)
+class _Begun:
+    """A process that has told what is in a file, and its first block.
+
+    Attributes:
+        about: what the file says.
+        columns: of the first block; None if there is no row.
+        frames: what it tells next.
+        pid: of this process; after a fork none but the one before it may go on.
+    """
+
+    about: dict[str, Any]
+    columns: list[NDArray[Any]] | None
+    frames: Iterator[tuple[bytes, bytes]]
+    pid: int
+
+
+class _Stream:
+    """One event stream of a file. Its process waits behind the first block until that is read.
+
+    So that there are never many processes, only those of the latest `_MOST_WAITING` files wait; of others it
+    starts anew.
+
+    Args:
+        path: of the file.
+        name: of the stream; None for the only one.
+    """
+
+    def __init__(self, path: Path, name: str | None) -> None:
+        self._path, self._name = path, name
+        self._begun: _Begun | None = None
+
+    def take(self) -> _Begun:
+        """The process that waits, or a new one.
+
+        Raises:
+            InputError: it refuses the file.
+            _DamageError: it fails before the first block.
+        """
+        begun, self._begun = self._begun, None
+        _waiting.pop(self, None)
+        if begun and begun.pid == os.getpid():
+            return begun
+        frames = _frames(self._path, self._name)
+        _, data = next(frames)
+        return _Begun(json.loads(data), next(_blocks(frames), None), frames, os.getpid())
+
+    def keep(self, begun: _Begun) -> None:
+        """Have it wait; nothing behind its first block has been read."""
+        self._begun = begun
+        _waiting[self] = None
+        if len(_waiting) > _MOST_WAITING:
+            oldest, _ = next(iter(_waiting.items()))
+            del _waiting[oldest]
+            oldest._begun = None
+
+
+_MOST_WAITING = 4
+_waiting: "WeakKeyDictionary[_Stream, None]" = WeakKeyDictionary()
+
+
 def open_hdf5(path: Path, head: bytes, options: TableOptions) -> Contents:
     """Find the event stream, its resolution, and what its columns are; reads the first block."""
-    about: dict[str, Any] = {}
-    columns: list[NDArray[Any]] = []
+    stream = _Stream(path, options.stream)
     try:
-        for kind, data in _frames(path, options.stream):
-            if kind == b"i":
-                about = json.loads(data)
-            elif kind == b"b":
-                break
-            elif kind == b"e":
-                columns = _ecf_columns(data)
-                break
-            else:
-                columns.append(np.load(BytesIO(data), allow_pickle=False))
+        begun = stream.take()
     except _DamageError as error:
         raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
+    about = begun.about
     said = list(about["assumptions"])
     layout: Layout | None = None
-    if columns:
-        layout = layout_of(path, columns, about["names"], options, unit=about["unit"])
+    if begun.columns:
+        layout = layout_of(path, begun.columns, about["names"], options, unit=about["unit"])
         said += layout.assumptions
+        stream.keep(begun)
     resolution = None
     if about["resolution"] and not options.resolution:
         resolution = checked_resolution(path, *about["resolution"])
-    read = partial(_read_hdf5, path, options.stream, layout, int(about["offset"]))
+    read = partial(_read_hdf5, path, stream, layout, int(about["offset"]))
     return Contents(read, resolution, 0, tuple(about["streams"]), tuple(said))
 
 
 def _read_hdf5(
-    path: Path, stream: str | None, layout: Layout | None, offset_us: int, losses: Losses
+    path: Path, stream: _Stream, layout: Layout | None, offset_us: int, losses: Losses
 ) -> Iterator[Events]:
     """Rows of one event stream; where a chunk is damaged, those before it are kept."""
     if layout is None:
         return
     rows = Rows(path, layout.unit, offset_us)
-    columns: list[NDArray[Any]] = []
     try:
-        for kind, data in _frames(path, stream):
-            if kind == b"e":
-                columns = _ecf_columns(data)
-            if kind in b"eb":
-                yield rows.events({f: columns[i] for f, i in zip("txyp", layout.order, strict=True)})
-                columns = []
-            elif kind == b"c":
-                columns.append(np.load(BytesIO(data), allow_pickle=False))
+        begun = stream.take()
+        events = rows.events(_named(begun.columns or [], layout))
+        try:
+            yield events
+        except GeneratorExit:
+            stream.keep(begun)
+            raise
+        begun.columns = None
+        for columns in _blocks(begun.frames):
+            yield rows.events(_named(columns, layout))
     except _DamageError as error:
         if rows.n == 0:
             raise InputError(f"{path}: damaged before the first event: {error}") from error
         losses.lose(0, f"everything after event {rows.n} is lost: {error}")
+
+
+def _named(columns: list[NDArray[Any]], layout: Layout) -> dict[str, NDArray[Any]]:
+    return {field: columns[i] for field, i in zip("txyp", layout.order, strict=True)}
+
+
+def _blocks(frames: Iterator[tuple[bytes, bytes]]) -> Iterator[list[NDArray[Any]]]:
+    """The columns of one block after the other."""
+    columns: list[NDArray[Any]] = []
+    for kind, data in frames:
+        if kind == b"e":
+            yield _ecf_columns(data)
+        elif kind == b"b":
+            yield columns
+            columns = []
+        else:
+            columns.append(np.load(BytesIO(data), allow_pickle=False))
 
 
 def _ecf_columns(frame: bytes) -> list[NDArray[Any]]:
@@ -124,7 +198,7 @@ def _frames(path: Path, stream: str | None) -> Iterator[tuple[bytes, bytes]]:
         str(path.resolve()),
         stream or "",
     ]
-    quiet = subprocess.DEVNULL
+    quiet, pid = subprocess.DEVNULL, os.getpid()
     with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet) as process:
         assert process.stdout
         try:
@@ -139,5 +213,6 @@ def _frames(path: Path, stream: str | None) -> Iterator[tuple[bytes, bytes]]:
                     raise _DamageError(one_line(ValueError(data.decode())))
                 yield kind, data
         finally:
-            process.kill()  # its output is not read any further
+            if os.getpid() == pid:
+                process.kill()  # its output is not read any further
         raise _DamageError("the HDF5 library does not come to an end, or fails")

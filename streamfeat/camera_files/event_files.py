@@ -233,7 +233,9 @@ def read_events(
         InputError: see `open_events` and `EventFile.__iter__`.
     """
     file = open_events(path, format, options=options)
-    events = np.concatenate([np.empty(0, EVENT_DTYPE), *file])
+    # As numbers: records NumPy joins field by field, in ten times the time.
+    batches = [np.ascontiguousarray(batch).view(np.int64) for batch in file]
+    events = np.concatenate([np.empty(0, np.int64), *batches]).view(EVENT_DTYPE)
     resolution = file.declared or (int(events["y"].max(initial=0)) + 1, int(events["x"].max(initial=0)) + 1)
     return ForeignFile(events, resolution, file.format, file.lost_bytes, tuple(file.damage))
 

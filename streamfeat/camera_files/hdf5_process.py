@@ -55,8 +55,6 @@ def serve(path: Path, stream: str, out: BinaryIO) -> None:
         return
     _limit(_OPEN_S)
     try:
-        with contextlib.suppress(ImportError):
-            import hdf5plugin  # noqa: F401  registers Blosc and others with h5py
         with h5py.File(path, "r") as root:
             tables, halves = _tables(h5py, root)
             name, assumptions = _chosen(tables, halves, stream)
@@ -70,8 +68,7 @@ def serve(path: Path, stream: str, out: BinaryIO) -> None:
                 _say_chunks(out, datasets[0])
                 _say(out, b"z", b"")
                 return
-            size = sum(dataset.dtype.itemsize * math.prod(dataset.shape[1:]) for dataset in datasets)
-            step = max(1, _BLOCK_BYTES // max(size, 1))
+            step = _rows_of_block(datasets)
             for row in range(0, len(datasets[0]), step):
                 _limit(_BLOCK_S)
                 _say_rows(out, [dataset[row : row + step] for dataset in datasets])
@@ -81,6 +78,14 @@ def serve(path: Path, stream: str, out: BinaryIO) -> None:
         _say(out, b"d", str(error).encode("utf-8", "replace"))
     else:
         _say(out, b"z", b"")
+
+
+def _rows_of_block(datasets: list[Any]) -> int:
+    """Rows that are read at a time: whole chunks, for one that is read in parts is unpacked for each."""
+    size: int = max(1, sum(dataset.dtype.itemsize * math.prod(dataset.shape[1:]) for dataset in datasets))
+    length: int = max((dataset.chunks[0] for dataset in datasets if dataset.chunks), default=1)
+    chunks: int = max(1, _BLOCK_BYTES // size // length)
+    return max(1, min(chunks * length, _CHUNK_BYTES // size))
 
 
 def _limit(seconds: float) -> None:
@@ -226,7 +231,7 @@ def _check(h5py: Any, root: Any, dataset: Any) -> None:
                 raise InputError(
                     "is compressed with ECF, but is no table of x, y, p, t with this filter alone"
                 )
-        elif not h5py.h5z.filter_avail(code):
+        elif not _is_available(h5py, code):
             raise InputError(
                 f"is compressed with HDF5 filter {code} ({name.decode('ascii', 'replace')}), which is not "
                 "installed; pip install 'streamfeat[convert]' has Blosc, LZ4, Zstandard and others"
@@ -236,6 +241,14 @@ def _check(h5py: Any, root: Any, dataset: Any) -> None:
     chunk_bytes = math.prod(dataset.chunks) * row if dataset.chunks else 0
     if dataset.nbytes > _SQUEEZE * stored or chunk_bytes > _CHUNK_BYTES:
         raise InputError(f"claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}")
+
+
+def _is_available(h5py: Any, code: int) -> bool:
+    """Whether a filter can be undone, if need be with the package that brings most of them, slow to load."""
+    if not h5py.h5z.filter_avail(code):
+        with contextlib.suppress(ImportError):
+            import hdf5plugin  # noqa: F401  registers Blosc and others with h5py
+    return bool(h5py.h5z.filter_avail(code))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
 """The words that sensors write: `.dat`, 40-bit `.bin`, EVT 2.0 and EVT 3.0, in files of their own.
 
 Lives here: headers of `% key value` lines, and fixed-size records to events, a bounded block at a time.
-Not here: EVT 2.1 and 4.0 (`vectors`), which format a file has (`event_files`), and packets
-(`streamfeat.messages`).
+Not here: the loops over words (`streamfeat.kernels.file_codes`), EVT 2.1 and 4.0 (`vectors`), which format a
+file has (`event_files`), and packets (`streamfeat.messages`).
 
-Records of fixed size are a few lines of NumPy: 13 to 27 million events a second on two shared cores, where
-packets are written at 2 to 5, so a library would buy nothing. EVT3 uses the decoder of packets, reading
-t = TIME_HIGH << 12 | TIME_LOW as published. On recorded words where TIME_LOW steps back, expelliarmus 1.1.12
-adds 4096 us at each step, beyond what the TIME_HIGH words allow, and faery 0.7.1 holds the time until it is
-reached again. `tools/compare_decoders.py` prints all of this.
+EVT3 uses the decoder of packets, reading t = TIME_HIGH << 12 | TIME_LOW as published. On recorded words where
+TIME_LOW steps back, expelliarmus 1.1.12 adds 4096 us at each step, beyond what the TIME_HIGH words allow, and
+faery 0.7.1 holds the time until it is reached again. `tools/compare_decoders.py` prints all of this.
 """
 
 import re
@@ -23,7 +21,8 @@ from numpy.typing import NDArray
 
 from streamfeat.camera_files.source import BLOCK_BYTES, Contents, Losses, TableOptions, checked_resolution
 from streamfeat.errors import InputError
-from streamfeat.events import Events, Resolution, make_events
+from streamfeat.events import EVENT_DTYPE, Events, Resolution, make_events
+from streamfeat.kernels.file_codes import decode_dat, decode_evt2
 from streamfeat.messages.codecs import make_decoder
 
 __all__ = [
@@ -190,11 +189,13 @@ class Unwrapped:
 
 
 def _read_dat(path: Path, start: int, losses: Losses) -> Iterator[Events]:
-    """u32 microseconds that wrap, then u32: x in bits 0-13, y in bits 14-27, polarity above."""
-    unwrapped = Unwrapped(32)
+    """Records of 8 bytes; their 32-bit times wrap inside the file and go on."""
+    state = np.array([-1, 0])
     for block in blocks_of(path, start, 8, losses):
-        t, word = np.frombuffer(block, "<u4").reshape(-1, 2).T
-        yield make_events(word & 0x3FFF, word >> 14 & 0x3FFF, word >> 28 != 0, unwrapped(t.astype(np.int64)))
+        records = np.frombuffer(block, "<u4").reshape(-1, 2).copy()
+        events = np.zeros(len(records), EVENT_DTYPE)
+        decode_dat(records, state, events)
+        yield events
 
 
 def _read_bin40(path: Path, losses: Losses) -> Iterator[Events]:
@@ -223,20 +224,12 @@ def _read_bin40(path: Path, losses: Losses) -> Iterator[Events]:
 
 
 def _read_evt2(path: Path, start: int, losses: Losses) -> Iterator[Events]:
-    """u32 words (Prophesee EVT 2.0): type in bits 28-31; CD words hold 6 bits of time, x (11), y (11).
-
-    TIME_HIGH holds 28 bits of time above those 6; its wraps are counted. Events before the first are skipped.
-    """
-    times = HighTimes()
+    """u32 words; wraps of their TIME_HIGH are counted, events before the first are skipped."""
+    state = np.array([-1, 0])
     for block in blocks_of(path, start, 4, losses):
-        words = np.frombuffer(block, "<u4")
-        kind = words >> 28
-        keep = kind <= 1
-        high, known = times(kind == 8, words)
-        keep &= known
-        word = words[keep]
-        t = high[keep] << 6 | (word >> 22 & 0x3F)
-        yield make_events(word >> 11 & 0x7FF, word & 0x7FF, word >> 28, t)
+        words = np.frombuffer(block, "<u4").copy()
+        events = np.zeros(len(words), EVENT_DTYPE)
+        yield events[: decode_evt2(words, state, events)]
 
 
 class HighTimes:

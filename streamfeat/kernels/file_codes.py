@@ -1,6 +1,6 @@
-"""Codes that occur in files only: Event Stream (`.es`), ECF of Prophesee's HDF5, and numbers in text.
+"""Codes that occur in files only: EVT 2.0, `.dat`, Event Stream (`.es`), ECF of HDF5, and numbers in text.
 
-Lives here: one loop for each, bytes in and events out, every read within bounds.
+Lives here: one loop for each, bytes or words in and events out, every read within bounds.
 Not here: headers, blocks and damage (`streamfeat.camera_files`), and packets (`decode`).
 """
 
@@ -10,10 +10,95 @@ from numpy.typing import NDArray
 from streamfeat.events import Events
 from streamfeat.kernels.compiled import inlined, kernel
 
-__all__ = ["ECF_PADDING", "decode_ecf", "decode_event_stream", "decode_groups", "parse_rows"]
+__all__ = [
+    "ECF_PADDING",
+    "decode_dat",
+    "decode_ecf",
+    "decode_event_stream",
+    "decode_evt2",
+    "decode_groups",
+    "parse_rows",
+    "turns_between",
+]
 
 ECF_PADDING = 16
 """Bytes that must follow the data of `decode_ecf`, so that a field at its end is read within the array."""
+
+
+@inlined
+def turns_between(before: int, now: int, bits: int) -> int:
+    """How often a counter turned: a fall of more than half its range is a turn, such a rise takes one back.
+
+    Args:
+        before: the count before, -1 if there is none.
+        now: the count.
+        bits: of the counter.
+
+    Returns:
+        -1, 0 or 1.
+    """
+    half = np.int64(1) << (bits - 1)
+    if before < 0:
+        return 0
+    return int(now - before < -half) - int(now - before > half)
+
+
+@kernel
+def decode_evt2(words: NDArray[np.uint32], state: NDArray[np.int64], out: Events) -> int:
+    """Decode words of EVT 2.0: type in bits 28 to 31; CD words hold 6 bits of time, x (11) and y (11).
+
+    TIME_HIGH holds 28 bits of time above those 6. Events before the first are left out, and so are words of
+    other types.
+
+    Args:
+        words: `(n,)` uint32, not changed.
+        state: `(2,)` int64, changed: the latest TIME_HIGH, -1 before the first, and how often it has turned.
+        out: `(n,)` EVENT_DTYPE, changed.
+
+    Returns:
+        The number of events written.
+    """
+    latest, turns = state
+    # An event from before a turn may still come after it, but there is nothing before the first.
+    high = (latest | max(turns, 0) << 28) << 6
+    n = 0
+    for value in words:
+        word = np.int64(value)
+        kind = word >> 28
+        if kind <= 1 and latest >= 0:
+            out[n].x = word >> 11 & 0x7FF
+            out[n].y = word & 0x7FF
+            out[n].p = kind
+            out[n].t = high | (word >> 22 & 0x3F)
+            n += 1
+        elif kind == 8:
+            turns += turns_between(latest, word & 0xFFFFFFF, 28)
+            latest = word & 0xFFFFFFF
+            high = (latest | max(turns, 0) << 28) << 6
+    state[0], state[1] = latest, turns
+    return n
+
+
+@kernel
+def decode_dat(records: NDArray[np.uint32], state: NDArray[np.int64], out: Events) -> None:
+    """Decode records of `.dat`: microseconds that wrap; x in bits 0 to 13, y in 14 to 27, polarity above.
+
+    Args:
+        records: `(n, 2)` uint32, not changed.
+        state: `(2,)` int64, changed: the latest time as counted, -1 before the first, and how often it has
+            turned.
+        out: `(n,)` EVENT_DTYPE, changed.
+    """
+    latest, turns = state
+    for i in range(records.shape[0]):
+        t, word = np.int64(records[i, 0]), np.int64(records[i, 1])
+        turns += turns_between(latest, t, 32)
+        latest = t
+        out[i].x = word & 0x3FFF
+        out[i].y = word >> 14 & 0x3FFF
+        out[i].p = word >> 28 != 0
+        out[i].t = t + (max(turns, 0) << 32)
+    state[0], state[1] = latest, turns
 
 
 @kernel

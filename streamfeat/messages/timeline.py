@@ -151,8 +151,10 @@ class Timeline:
         Raises:
             InputError: the bytes are no such message, or its payload is not what it says.
         """
-        self._happened["out of order"] += log_time_ns < self._heard_ns
-        self._heard_ns = max(self._heard_ns, log_time_ns)
+        if log_time_ns < self._heard_ns:
+            self._happened["out of order"] += 1
+        else:
+            self._heard_ns = log_time_ns
         try:
             content = parse_events(schema, data, layout)
         except InputError:
@@ -271,6 +273,9 @@ class Timeline:
             n_inside = arrived.measure(self._span)
         if n_inside == 0:
             return [*done, *self._without_times(arrived)]
+        may_be_odd = self._held or self._counts_anew or is_late
+        if not may_be_odd and self._clock.goes_on(arrived.first_us, arrived.last_us, arrived.now_ns):
+            return [*done, self._made(arrived, None)]
         if is_late and self._is_behind(arrived.last_us):
             return [*done, self._use(arrived, is_late=True)]
         arrived.anew, self._counts_anew = self._counts_anew, False
@@ -324,10 +329,6 @@ class Timeline:
     def _count(self, what: str, detail: str, n: int = 1) -> None:
         self._happened[what] += n
         self._tell(what, detail)
-
-    def _taken_lost(self) -> int:
-        lost, self._lost = self._lost, 0
-        return lost
 
     def _is_behind(self, last_us: int) -> bool:
         """Whether a time is one that the clock has passed, if it went on as it did."""
@@ -385,6 +386,7 @@ class Timeline:
         return self._made(arrived, None)
 
     def _made(self, arrived: Arrived, until_us: int | None) -> Packet:
+        lost, self._lost = self._lost, 0
         return Packet(
             self._topic,
             arrived.events,
@@ -392,7 +394,7 @@ class Timeline:
             arrived.log_time_ns,
             arrived.seq,
             arrived.source_ns,
-            self._taken_lost(),
+            lost,
             self._clock.epoch,
             until_us,
         )
