@@ -230,7 +230,7 @@ def _unit_of(t: NDArray[Any]) -> tuple[str, str]:
     t = t[np.isfinite(t)] if t.dtype.kind == "f" else t
     # A few absurd times say nothing of the others.
     few = 0.01 if len(t) >= 2 * _LEAST_ROWS else 0.0
-    low, top = np.quantile(t, (few, 1 - few)).tolist() if len(t) else (0.0, 0.0)
+    top = float(np.quantile(t, 1 - few)) if len(t) else 0.0
     is_whole = bool((t == np.rint(t)).all())
     if is_whole and top >= 1e17:
         return "ns", "as whole numbers of this size they count from 1970"
@@ -240,14 +240,15 @@ def _unit_of(t: NDArray[Any]) -> tuple[str, str]:
         return "ms", "as numbers of this size with fractions they count from 1970"
     units = (("us", 1e6), ("ns", 1e9)) if is_whole else (("s", 1.0), ("ms", 1e3), ("us", 1e6))
     form = "they are whole numbers" if is_whole else "they have fractions"
-    span = (top - low) / (1 - 2 * few)
-    if len(t) < _LEAST_ROWS or span <= 0:
+    steps = np.sort(np.maximum(np.diff(t.astype(np.float64)), 0))
+    steps = steps[: len(steps) - int(few * len(steps))]  # nor do a few pauses
+    if len(t) < _LEAST_ROWS or not steps.any():
         return units[0][0], form
-    rates = [(unit, len(t) / span * ticks) for unit, ticks in units]
+    rates = [(unit, len(steps) / steps.sum() * ticks) for unit, ticks in units]
     unit = next((unit for unit, rate in rates if rate >= _LEAST_RATE), units[-1][0])
     if unit == units[0][0]:
         return unit, form
-    slow = len(t) / span * units[0][1]
+    slow = rates[0][1]
     return unit, f"{form}, and as {_IN_WORDS[units[0][0]]} they would hold {slow:.3g} events a second"
 
 
