@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from streamfeat.stream.pipeline import Pipeline
     from streamfeat.stream.replay import replay
     from streamfeat.stream.session import Session
+    from streamfeat.view.drawing import draw
 
     __version__: str
 
@@ -46,6 +47,7 @@ __all__ = [
     "TransformLearner",
     "__version__",
     "as_events",
+    "draw",
     "general_encoder",
     "learn_encoder",
     "listen",
@@ -71,6 +73,7 @@ _HOMES = {
     "Session": "stream.session",
     "TransformLearner": "learn.transform",
     "as_events": "events",
+    "draw": "view.drawing",
     "general_encoder": "shipped.general",
     "learn_encoder": "learn.from_files",
     "listen": "live.listen",

@@ -133,6 +133,25 @@ def test_evt3_resync_keeps_the_wraps():
     ]
 
 
+@pytest.mark.parametrize(
+    ("encoding", "first", "second"),
+    [
+        ("libcaer_cmp", (0x2009, 0x3001, 0x4003, 0x50FF), (0x2001, 0x3FFF)),
+        ("evt3", (0x8001, 0x6002, 0x0003, 0x2805, 0x3810, 0x4FFF), (0x6009, 0x2001)),
+    ],
+)
+def test_events_stay_as_they_are_while_the_next_packet_is_decoded(encoding, first, second):
+    decoder, exact = make_decoder(encoding), make_decoder(encoding, max_events=14)
+    events = decoder.decode(words(*first), 0)
+    before = rows(events)
+    later = rows(decoder.decode(words(*second), 0))
+    assert rows(events) == before
+    # 14 events are fewer than the words could hold if all were vectors, so this decoder counts them first.
+    assert (rows(exact.decode(words(*first), 0)), rows(exact.decode(words(*second), 0))) == (before, later)
+    events["t"] += 5
+    assert rows(decoder.decode(words(*second), 0)) == later
+
+
 # --- kernels against their twins
 
 

@@ -176,4 +176,4 @@ def test_replay_takes_out_what_the_stage_does_and_says_how_much(run, tmp_path):
     result = run("replay", path, "-m", tmp_path / "m.safetensors", "--refractory", "20ms", "--json").json
     stage = Denoiser(Denoising(refractory_us=20_000))
     assert result["events"] == len(stage.events(events, tiny.RESOLUTION))
-    assert result["refractory"] == stage.removed["refractory"]
+    assert result["removed"]["refractory"] == stage.removed["refractory"]

@@ -105,11 +105,10 @@ def test_view_prints_its_fields(run, home, tmp_path):
         check("view", result.json)
 
 
-def test_fields_that_no_page_knows_are_refused():
-    with pytest.raises(KeyError, match="speed"):
-        complete("record", {"speed": 1})
-    said = complete("info", {"resolution": [260, 346]})
-    assert (said["topics"], said["unread"], said["first_us"]) == ([], {}, None)
+def test_all_fields_are_there_and_none_is_lost():
+    said = complete("info", {"new": 1, "resolution": [260, 346]})
+    assert list(said) == [*RESULTS["info"], "new"]
+    assert (said["topics"], said["unread"], said["first_us"], said["new"]) == ([], {}, None, 1)
 
 
 def test_people_see_what_says_something():

@@ -116,7 +116,7 @@ def test_replay_says_so(run, tmp_path, monkeypatch):
         ((260, 346), 580_000, (4, 1)),
         ((260, 346), 3_000, (2, 1)),
         ((480, 640), 2_000_000, (4, 2)),
-        ((720, 1280), 10_000_000, (4, 4)),
+        ((720, 1280), 10_000_000, (4, 2)),
     ],
 )
 def test_the_grid_that_suits_a_sensor(monkeypatch, resolution, rate, grid):

@@ -25,18 +25,22 @@ from streamfeat.evaluate.tables import (
     sweep_tables,
     value_text,
 )
-from streamfeat.report.pages import Section, Table, require, write_report
+from streamfeat.report.pages import Folded, Grid, Section, Table, Wide, require, write_report
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure
 
 __all__ = ["check_page", "tiled", "write_page"]
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_COLOURS = ("#1f83c9", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8f98")
 _TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
 _TILE_COLUMNS = 8
+_SMALL = 260
+_MOST_COUNTS = 30
+"""Classes that a confusion shows with their counts; more have room for their names only."""
+_PAIRS_SHOWN = 10
 
-Parts = list["str | Table | figure"]
+Parts = list[Any]
 
 
 def check_page(path: Path) -> None:
@@ -61,24 +65,36 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     machine = ", ".join(f"{name} {value}" for name, value in result["machine"].items())
     numeric = [name not in ("method", "geometry") for name in COLUMNS]
     table = Table(COLUMNS, [cells(row) for row in rows], numeric)
-    accuracy: Parts = [table]
+    best = max(rows, key=lambda row: row["accuracy"])
+    accuracy: Parts = [
+        f"Best: {best['method']}, {100 * best['accuracy']:.1f} % of held-out samples right "
+        f"({100 * best['low']:.1f} to {100 * best['high']:.1f})."
+    ]
+    warnings = [note for note in notes(result) if note.startswith("WARNING")]
+    said = [note for note in notes(result) if note not in warnings]
+    accuracy += [*warnings, _accuracies(rows), table]
     header, folds = fold_table(result)
     if folds:
-        accuracy.append(Table(header, folds, [False] + [True] * (len(header) - 1)))
-    sections = [Section("Accuracy", [*accuracy, *notes(result), f"Measured on: {machine}."])]
+        folded = Table(header, folds, [False] + [True] * (len(header) - 1))
+        accuracy.append(Folded("accuracy of each fold", [folded]))
+    accuracy.append(Folded("how this was measured", [*said, f"Measured on: {machine}."]))
+    sections = [Section("Accuracy", accuracy)]
     if sweeps := list(_sweeps(result)):
-        sections.append(Section("Sweeps", sweeps))
+        figures = [part for part in sweeps if not isinstance(part, Table)]
+        tables = [part for part in sweeps if isinstance(part, Table)]
+        sections.append(Section("Sweeps", [Grid(figures), Folded("figures of the sweeps", tables)]))
     if early := [row for row in rows if "early" in row]:
         sections.append(Section("Early decision", _early(result, early)))
     if online := [row for row in rows if "prequential" in row]:
         sections.append(Section("Online: predicting before learning", _online(result, online)))
-    confusions: Parts = [_confusion(row, result["labels"]) for row in rows]
-    sections.append(Section("Confusion", confusions))
+    sections.append(Section("Confusion", _confusions(rows, result["labels"])))
     learned = [row for row in rows if "learned" in row]
-    if history := [row for row in learned if "objective" in row["learned"]]:
-        sections.append(Section("Convergence", list(_convergence(history))))
     if learned:
-        sections.append(Section("Filters", list(_filters(learned))))
+        said_of_filters, *pictures = _filters(learned)
+        sections.append(Section("Filters", [said_of_filters, Grid(pictures)]))
+    if history := [row for row in learned if "objective" in row["learned"]]:
+        said_of_it, *pictures = _convergence(history)
+        sections.append(Section("Convergence", [Folded(str(said_of_it), [Grid(pictures)])]))
     write_report(path, f"streamfeat evaluate: {', '.join(result['recordings'])}", sections)
 
 
@@ -92,8 +108,21 @@ def _plot(x: str, y: str, *, height: int = 340, **options: Any) -> "figure":
     return plot
 
 
+def _accuracies(rows: Sequence[dict[str, Any]]) -> "figure":
+    """Each method's accuracy, with its interval: the result in one picture."""
+    names = list(reversed([row["method"] for row in rows]))
+    plot = _plot("accuracy", "", height=70 + 30 * len(rows), y_range=names)
+    shown = {name: [row[name] for row in rows] for name in ("method", "low", "high", "accuracy")}
+    plot.segment(
+        shown["low"], shown["method"], shown["high"], shown["method"], color=_COLOURS[0], line_width=3
+    )
+    plot.scatter(shown["accuracy"], shown["method"], color=_COLOURS[0], size=9)
+    return plot
+
+
 def _with_legend(plot: "figure") -> "figure":
-    plot.add_layout(plot.legend[0], "right")
+    plot.add_layout(plot.legend[0], "below")
+    plot.legend.ncols = 1
     plot.legend.click_policy = "hide"
     plot.legend.label_text_font_size = "12px"
     return plot
@@ -115,7 +144,7 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
         values = in_order(row["setting"][name] for row in rows)
         numbers = all_numbers(values)
         axis: dict[str, Any] = {} if numbers else {"x_range": [value_text(value) for value in values]}
-        plot = _plot({"patch": "patch, pixels"}.get(name, title), "accuracy", **axis)
+        plot = _plot({"patch": "patch, pixels"}.get(name, title), "accuracy", height=_SMALL + 80, **axis)
         methods = list(dict.fromkeys(row["method"] for row in rows))
         for i, method in enumerate(methods):
             mine = {row["setting"][name]: row for row in rows if row["method"] == method}
@@ -146,7 +175,8 @@ def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
             _line(plot, [p[unit] for p in points], [p["accuracy"] for p in points], row["method"], i)
     by_events.xaxis.formatter = NumeralTickFormatter(format="0,0")
     by_events.xaxis.ticker = sorted({p["events"] for row in rows for p in row["early"]["events"]})
-    return [Table(header, lines, [False, True, True, True]), _with_legend(by_time), _with_legend(by_events)]
+    table = Table(header, lines, [False, True, True, True])
+    return [Grid([_with_legend(by_time), _with_legend(by_events)]), table]
 
 
 def _online(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
@@ -158,12 +188,27 @@ def _online(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:
             name = f"{row['method']}, {'stream order' if order == 'stream' else order}"
             xs, ys = [p["samples"] for p in curve], [p["accuracy"] for p in curve]
             _line(plot, xs, ys, name, i, line_dash=dash)
-    return [Table(header, lines, [False, True, True]), _with_legend(plot)]
+    return [_with_legend(plot), Table(header, lines, [False, True, True])]
+
+
+def _confusions(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> Parts:
+    """Small ones beside each other; of many classes one below the other, with what is mixed up most."""
+    if len(names) <= _MOST_COUNTS:
+        return [Grid([_confusion(row, names) for row in rows])]
+    parts: Parts = []
+    for row in rows:
+        counts = np.array(row["confusion"])
+        np.fill_diagonal(counts, 0)
+        worst = np.argsort(-counts, axis=None, kind="stable")[:_PAIRS_SHOWN]
+        places = [divmod(int(at), len(names)) for at in worst if counts.flat[at]]
+        pairs = [[names[i], names[j], f"{counts[i, j]:,}"] for i, j in places]
+        header = [f"{row['method']}: is", "taken for", "samples"]
+        parts += [Table(header, pairs, [False, False, True])] if pairs else []
+        parts.append(Wide(_confusion(row, names), 180 + 11 * len(names)))
+    return parts
 
 
 def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
-    from bokeh.transform import linear_cmap
-
     counts = np.array(row["confusion"])
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     true, predicted = (index.ravel().tolist() for index in np.indices(counts.shape))
@@ -172,19 +217,21 @@ def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
         "predicted": [names[i] for i in predicted],
         "share": shares.ravel(),
         "count": [f"{count:,}" if count else "" for count in counts.ravel()],
-        "ink": ["white" if share > 0.5 else "#222" for share in shares.ravel()],
+        "ink": ["white" if share > 0.5 else "#767e87" for share in shares.ravel()],
     }
+    has_counts = len(names) <= _MOST_COUNTS
     plot = _plot(
         "predicted label",
         "true label",
-        height=max(260, 120 + 26 * len(names)),
+        height=max(_SMALL, 120 + (26 if has_counts else 11) * len(names)),
         x_range=list(names),
         y_range=list(reversed(names)),
-        title=f"{row['method']}: samples; colour is the share of the true label",
+        title=f"{row['method']}: samples by label",
     )
-    fill = linear_cmap("share", [f"#{g:02x}{g:02x}ff" for g in range(255, 60, -2)], 0, 1)
-    plot.rect("predicted", "true", 1, 1, source=data, fill_color=fill, line_color="#ddd")
-    if len(names) <= 30:
+    plot.rect(
+        "predicted", "true", 1, 1, source=data, fill_color=_COLOURS[0], fill_alpha="share", line_color=None
+    )
+    if has_counts:
         plot.text(
             "predicted",
             "true",
@@ -196,6 +243,9 @@ def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
             text_font_size="12px",
         )
     else:
+        for axis in plot.axis:
+            axis.major_label_text_font_size = "9px"
+    if len(names) > 6:
         plot.xaxis.major_label_orientation = "vertical"
     return plot
 

@@ -17,7 +17,7 @@ from streamfeat.files.atomic import write_atomically
 from streamfeat.latency.measure import LatencyReport, Row
 from streamfeat.latency.text import COLUMNS, cells, describe, notes
 from streamfeat.latency.update import Walk
-from streamfeat.report.pages import Section, Table, require, write_report
+from streamfeat.report.pages import Folded, Section, Table, require, write_report
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure
@@ -27,7 +27,7 @@ __all__ = ["check_picture", "draw"]
 _LIBRARIES = {".html": "bokeh", ".png": "matplotlib"}
 _MOST_POINTS = 6_000
 _LONGEST_SILENCE_US = 100_000
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8f98", "#b5a642")
 _DASHES = {
     "update": "solid",
     "bin boundary": "dotted",
@@ -118,20 +118,21 @@ def _points(
 
 def _draw_page(path: Path, report: LatencyReport) -> None:
     numeric = [False, False] + [True] * (len(COLUMNS) - 2)
-    figures: list[str | Table | figure] = []
+    figures: list[Any] = []
     for model in dict.fromkeys(row.model.name for row in report.rows):
         rows = [row for row in report.rows if row.model.name == model]
         figures += [describe(rows[0].model), Table(COLUMNS, [cells(row) for row in rows], numeric)]
     sections = [
-        Section("Latency", [*figures, *notes(report)]),
         Section("Percentiles", [_curves_of_page(report), "A name in the legend hides its line."]),
+        Section("Latency", [*figures, Folded("how this was measured", notes(report))]),
     ]
     if _walks(report):
-        shown: list[str | Table | figure] = []
+        shown: list[Any] = []
         for name, walk in _walks(report):
             shown += [name, _cloud_of_page(walk)]
         sections.append(Section("Each update over stream time", shown))
-    write_report(path, f"streamfeat latency: {report.result()['recording']}", sections)
+    name = Path(report.result()["recording"]).name
+    write_report(path, f"streamfeat latency: {name}", sections)
 
 
 def _curves_of_page(report: LatencyReport) -> "figure":
@@ -155,7 +156,8 @@ def _curves_of_page(report: LatencyReport) -> "figure":
         items.append((name, [line]))
         hover = HoverTool(renderers=[line], tooltips=[(name, "@us{0.000} µs at @percent{0.0000} %")])
         plot.add_tools(hover)
-    plot.add_layout(Legend(items=items, click_policy="hide", label_text_font_size="11px"), "right")
+    legend = Legend(items=items, click_policy="hide", label_text_font_size="11px")
+    plot.add_layout(legend, "below")
     plot.xaxis.ticker = FixedTicker(ticks=list(_TICKS))
     plot.xaxis.major_label_overrides = dict(_TICKS)
     return plot

@@ -157,17 +157,23 @@ def mosaic(images: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     return grid
 
 
-def png(grey: NDArray[np.uint8]) -> bytes:
-    """A PNG file of `(h, w)` uint8, as in RFC 2083: header, one deflated block of unfiltered rows, end."""
-    height, width = grey.shape
-    raw = np.zeros((height, width + 1), np.uint8)  # each row begins with its filter, 0 for none
-    raw[:, 1:] = grey
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """A PNG file, as in RFC 2083: header, one deflated block of unfiltered rows, end.
+
+    Args:
+        pixels: `(h, w)` uint8 for greys, or `(h, w, 4)` for red, green, blue and alpha; not changed.
+    """
+    height, width = pixels.shape[:2]
+    rows = pixels.reshape(height, -1)
+    raw = np.zeros((height, rows.shape[1] + 1), np.uint8)  # each row begins with its filter, 0 for none
+    raw[:, 1:] = rows
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         checked = kind + content
         return struct.pack(">I", len(content)) + checked + struct.pack(">I", zlib.crc32(checked))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    kind_of_colour = 0 if pixels.ndim == 2 else 6
+    header = struct.pack(">IIBBBBB", width, height, 8, kind_of_colour, 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", header)

@@ -193,7 +193,7 @@ class ReplayJob:
             "events_per_s": round(stats.events / max(self._seconds, 1e-9)),
             "compile_seconds": round(self._compile_seconds, 3),
             "emissions": stats.emissions,
-            "emit": str(self._session.policy),
+            "emit": str(self._policy),
             "samples": stats.samples,
         }
         if stats.correct is not None and stats.samples:
