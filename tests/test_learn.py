@@ -448,10 +448,10 @@ def test_a_geometry_has_every_value_of_a_setting_that_it_knows():
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """Log times of the packets that are decoded."""
-    times, decode = [], PacketReader.read
-    monkeypatch.setattr(PacketReader, "read", lambda *given: times.append(given[3]) or decode(*given))
-    return times
+    """The messages of events that are decoded."""
+    messages, decode = [], PacketReader.decode
+    monkeypatch.setattr(PacketReader, "decode", lambda *given: messages.append(given[2]) or decode(*given))
+    return messages
 
 
 @pytest.mark.parametrize(("window_ms", "opened"), [(None, 2), (100.0, 1)])
