@@ -12,10 +12,12 @@ from rich.markup import escape
 
 from streamfeat.cli.program import (
     JsonOption,
+    OpenOption,
     OverwriteOption,
     QuietOption,
     RecordingArgument,
     TopicOption,
+    WebPortOption,
     app,
     err,
     print_losses,
@@ -47,13 +49,8 @@ def label(
         Path | None,
         typer.Option("--mcap", help="At the end, write events and labels to this recording, too."),
     ] = None,
-    web_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Where the page is, on loopback; 0 is any.")
-    ] = 8766,
-    open_browser: Annotated[
-        bool | None,
-        typer.Option("--open/--no-open", help="Open the page in a browser. Opened where there is a display."),
-    ] = None,
+    web_port: WebPortOption = 8766,
+    open_browser: OpenOption = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,

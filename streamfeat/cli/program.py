@@ -44,6 +44,7 @@ __all__ = [
     "EmitOption",
     "JsonOption",
     "ModelOption",
+    "OpenOption",
     "OverwriteOption",
     "QuietOption",
     "RecordingArgument",
@@ -52,6 +53,7 @@ __all__ = [
     "StepsOption",
     "TopicOption",
     "VerboseOption",
+    "WebPortOption",
     "WorkersOption",
     "app",
     "completing",
@@ -179,6 +181,13 @@ ThreadsOption = Annotated[
         help="Threads that share a large emission; features are the same for any number.",
         show_default="all cores but one",
     ),
+]
+WebPortOption = Annotated[
+    int, typer.Option(min=0, max=65535, help="Where the page is, on loopback; 0 is any.")
+]
+OpenOption = Annotated[
+    bool | None,
+    typer.Option("--open/--no-open", help="Open the page in a browser. Opened where there is a display."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show the summary only.")]

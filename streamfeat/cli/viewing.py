@@ -14,10 +14,12 @@ from streamfeat.cli.live import ConfigOption, DomainOption, RosOption, names_of
 from streamfeat.cli.program import (
     EmitOption,
     JsonOption,
+    OpenOption,
     OverwriteOption,
     QuietOption,
     ThreadsOption,
     TopicOption,
+    WebPortOption,
     app,
     err,
     model_or_general,
@@ -58,13 +60,8 @@ def view(
         bool | None,
         typer.Option("--web/--no-web", help="Serve the page. Served unless there is -o or --foxglove."),
     ] = None,
-    web_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Where the page is, on loopback; 0 is any.")
-    ] = 8766,
-    open_browser: Annotated[
-        bool | None,
-        typer.Option("--open/--no-open", help="Open the page in a browser. Opened where there is a display."),
-    ] = None,
+    web_port: WebPortOption = 8766,
+    open_browser: OpenOption = None,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Serve the Foxglove app; extra `view`.")
     ] = False,

@@ -177,8 +177,8 @@ class _Traffic(Generic[In, Out]):
         return PipelineStats(self.items, self.inbox.qsize(), self.outbox.qsize(), 0, self.stopped)
 
 
-class _Stages(Generic[In, Out]):
-    """The three tasks of a pipeline."""
+class _Connected(Generic[In, Out]):
+    """A processor and its sinks, with what is on its way between them."""
 
     def __init__(
         self,
@@ -189,6 +189,10 @@ class _Stages(Generic[In, Out]):
     ) -> None:
         self._processor, self._sinks = processor, sinks
         self._traffic, self._threads = traffic, threads
+
+
+class _Stages(_Connected[In, Out]):
+    """The three tasks of a pipeline."""
 
     async def read(
         self,
@@ -246,18 +250,8 @@ class _Stages(Generic[In, Out]):
             self._traffic.under_way -= 1
 
 
-class _Bypass(Generic[In, Out]):
+class _Bypass(_Connected[In, Out]):
     """Processes and writes in the reader's thread, as long as the other two would only wait for it."""
-
-    def __init__(
-        self,
-        processor: Processor[In, Out],
-        sinks: Sequence[Sink[Out]],
-        traffic: _Traffic[In, Out],
-        threads: Threads,
-    ) -> None:
-        self._processor, self._sinks = processor, sinks
-        self._traffic, self._threads = traffic, threads
 
     def next_group(self, groups: Iterator[Group[In]]) -> list[In] | None:
         """The next group that the other tasks shall see to; None at the end, or when that has come early."""
