@@ -36,11 +36,11 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
-def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def read_safetensors(path: Path, kind: str, *versions: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read all arrays of a safetensors file and the JSON header that streamfeat keeps with them.
 
     Raises:
-        InputError: the file cannot be read, or its header is not of this kind and version.
+        InputError: the file cannot be read, or its header is not of this kind and one of these versions.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -60,9 +60,10 @@ def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDA
         raise InputError(f"{path}: not a readable safetensors file: {one_line(error)}") from error
     if not isinstance(header, dict) or header.get("format") != kind:
         raise InputError(f"{path}: a safetensors file, but not a {kind} file")
-    if header.get("version") != version:
+    if header.get("version") not in versions:
         raise InputError(
-            f"{path}: format version {header.get('version')!r}, this streamfeat reads version {version}; "
+            f"{path}: format version {header.get('version')!r}, this streamfeat reads version "
+            f"{' and '.join(map(str, versions))}; "
             "make the file again"
         )
     return arrays, header
