@@ -201,7 +201,7 @@ class DataSet:
 
     @contextlib.contextmanager
     def open(self, fold: int | None) -> Iterator[list[Recording]]:
-        """The recordings with the splits of one fold, closed afterwards; of None, no fold holds anything out."""
+        """The recordings with the splits of one fold, closed afterwards; with None, no fold holds out any."""
         with contextlib.ExitStack() as files:
             if self._folds and fold is None:
                 yield [
