@@ -169,7 +169,7 @@ def listen(
     verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The main job on live topics: one engine for each camera, results published beside it."""
+    """Live topics to features and predictions: an engine for each camera, results published beside it."""
     from streamfeat.live.listen import ListenJob
     from streamfeat.live.network import Network
     from streamfeat.live.shard import Shard

@@ -76,7 +76,7 @@ def replay(
     verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The main job on a recording: events to features to predictions, scored where there are labels."""
+    """A recording to features and predictions, scored where there are labels."""
     from streamfeat.stream.outputs import Outputs
     from streamfeat.stream.replay import ReplayJob, parse_speed
 
