@@ -131,7 +131,7 @@ def test_a_long_name_above_a_short_table_is_not_broken_into_its_width(capsys):
     [
         (["repaly"], "error: no such command 'repaly'. Did you mean 'replay'? (`streamfeat -h` says more)"),
         (["replay"], "error: missing argument 'REC' (`streamfeat replay -h` says more)"),
-        (["replay", "x.mcap", "--emmit", "10ms"], "error: no such option: --emmit (Possible options: --emit)"),
+        (["replay", "x.mcap", "--emmit", "10ms"], "error: no such option: --emmit"),
         (["learn", "x.mcap"], "error: missing option '--output' / '-o' (`streamfeat learn -h` says more)"),
         (["replay", "x.mcap", "--speed"], "error: option '--speed' requires an argument"),
     ],
