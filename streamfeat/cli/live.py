@@ -35,6 +35,7 @@ from streamfeat.cli.program import (
     print_result,
     progress_bars,
     refuse_existing,
+    tell_compiling,
     working,
 )
 from streamfeat.cli.reading import (
@@ -203,6 +204,7 @@ def listen(
         names, chosen, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
     )
     to_terminal = str(json_lines) == "-"
+    tell_compiling(quiet=quiet)
     job.run(
         Outputs(
             console=None if quiet or as_json or to_terminal else out,
