@@ -50,7 +50,7 @@ def markdown(results: dict[str, Any]) -> str:
 def verdict_lines(results: dict[str, Any]) -> list[str]:
     """One line a target, for the terminal."""
     return [
-        f"{_verdict(v):>9}  {v.target.figure.replace('`', '')}: {_value(v)}, target {v.target.text}"
+        f"{_verdict(v):>9}  {v.target.figure.replace('`', '')}: {_value(v)}, floor {v.target.text}"
         for v in judge(results)
     ]
 
@@ -69,8 +69,8 @@ def _machine(results: dict[str, Any]) -> str:
 
 
 def _targets(results: dict[str, Any]) -> str:
-    rows = [(v.target.figure, v.target.text, _value(v), _verdict(v)) for v in judge(results)]
-    return _table(("figure", "target", "measured", ""), rows)
+    rows = [(v.target.figure, v.target.text, _value(v), _verdict(v), v.target.why) for v in judge(results)]
+    return _table(("figure", "floor", "measured", "", "why this much"), rows)
 
 
 def _verdict(verdict: Verdict) -> str:
@@ -209,7 +209,7 @@ def _memory(part: dict[str, Any]) -> str:
     operator = next(iter(part.values()))["operator_bytes"] / 1e6
     return (
         "**Memory** of an engine for 640x480, downsample 4, stride 4, in MB. The minimum: `4 T H W` for "
-        "counts, `4 V K` for projections, `16 K` for pooled sums. The operator, "
+        "counts, `4 V K` for projections, looking ahead twice that, `16 K` for pooled sums. The operator, "
         f"{operator:.1f} MB, is shared and read-only.\n\n"
         + _table(("", "minimum", "state", "resident"), rows)
     )
