@@ -37,6 +37,9 @@ _OTHERS_USE = {
 }
 """Settings of methods that learn no filters here."""
 
+_SAME_IN_EVERY_FOLD = ("model", "counts")
+"""Methods that take nothing from the samples, so that all folds share their features."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial(Setting):
@@ -109,7 +112,13 @@ class Cell:
         mine, others = (
             replace(cell.setting, mirror=False, cuts="", shift=0, kernel="linear") for cell in (self, other)
         )
-        return (self.method, self.fold, mine) == (other.method, other.fold, others)
+        same_fold = self.fold == other.fold or self.has_features_of_all_folds
+        return same_fold and (self.method, mine) == (other.method, others)
+
+    @property
+    def has_features_of_all_folds(self) -> bool:
+        """Whether its features do not depend on which samples are held out."""
+        return self.method in _SAME_IN_EVERY_FOLD
 
 
 def parse_sweep(text: str) -> tuple[str, list[Any]]:
