@@ -593,6 +593,32 @@ def test_cells_that_differ_in_training_only_share_their_features(animals, monkey
 
 
 @needs_bokeh
+def test_folds_share_the_features_of_a_method_that_learns_nothing(unsplit, tmp_path, monkeypatch):
+    """Encoded once for all folds, variants too, with the results of each fold encoded by itself."""
+    encoded = []
+    encode = cell_module.encode_recordings
+
+    def counted(*arguments, **options):
+        encoded.append(options.get("variant"))
+        return encode(*arguments, **options)
+
+    monkeypatch.setattr(cell_module, "encode_recordings", counted)
+    tiny.encoder(k=3).save(tmp_path / "model")
+    base = {"mirror": True, "model": str(tmp_path / "model")}
+    data = DataSet([unsplit, unsplit], None, 3, 0)
+    cells = plan_cells(["model", "counts"], base, [("mirror", [False])], 3)
+    shared = evaluate(data, cells, early_samples=4)
+    assert len(encoded) == 4  # of each method the samples and their mirror images
+    monkeypatch.setattr(Cell, "has_features_of_all_folds", False)
+    apart = evaluate(data, cells, early_samples=4)
+    assert len(encoded) == 4 + 2 * 3 * 2
+    for row, other in zip(shared["rows"], apart["rows"], strict=True):
+        names = ("method", "swept", "hits", "folds", "confusion", "C", "samples")
+        assert [row[name] for name in names] == [other[name] for name in names]
+        assert row.get("early") == other.get("early")
+        assert row.get("prequential") == other.get("prequential")
+
+
 def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     output, page = tmp_path / "result.json", tmp_path / "result.html"
     every = [argument for method in METHODS for argument in ("--method", method)]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from streamfeat.classify.calibration import (
+    checked_by_folds,
     checked_temperature,
-    fitted_temperature,
     probabilities,
     temperature_field,
 )
@@ -280,7 +280,7 @@ def train_classifier(
         weights=np.ascontiguousarray(svm.coef_.T, np.float32),  # as files hold it, for the bits
         bias=svm.intercept_.astype(np.float32),
         fingerprint=encoder.fingerprint,
-        temperature=fitted_temperature(held_out[best], numbers),
+        temperature=checked_by_folds(held_out[best], numbers, parts),
         provenance={
             **(provenance or {}),
             "C": best,

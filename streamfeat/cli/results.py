@@ -149,6 +149,7 @@ RESULTS: dict[str, dict[str, Field]] = {
         "formulation": Field("text", "`direct` or `inverse`"),
         "filters": Field("int", "filters, or atoms"),
         "features": Field("int", "numbers that an emission has"),
+        "scales": Field("int", "scales whose features stand side by side", quiet=True),
         "volumes": Field("int", "local volumes that were learned from"),
         "empty_share": Field("number", "share of volumes without events, which were left out"),
         "iterations": Field("int", "passes over them"),

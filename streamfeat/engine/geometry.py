@@ -68,6 +68,10 @@ class Geometry:
         height, width = resolution
         return -(-height // self.downsample), -(-width // self.downsample)
 
+    def has_room(self, resolution: Resolution) -> bool:
+        """Whether a sensor of `(height, width)` pixels has a place for a volume."""
+        return min(self.ring_shape(resolution)) >= self.patch
+
     def grid_shape(self, resolution: Resolution) -> tuple[int, int]:
         """Rows and columns of volumes for a sensor of `(height, width)` pixels.
 
@@ -75,7 +79,7 @@ class Geometry:
             InputError: the sensor has no place for a single volume.
         """
         rows, columns = self.ring_shape(resolution)
-        if min(rows, columns) < self.patch:
+        if not self.has_room(resolution):
             height, width = resolution
             raise InputError(
                 f"geometry: a sensor of {width}x{height} pixels is {columns}x{rows} after downsample "

@@ -5,6 +5,7 @@ Lives here: the steps for one method in one setting on one fold. Not here: the t
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def run_cells(
 
     Args:
         data: the recordings.
-        cells: what to run; features are made once.
+        cells: what to run; features are made once, also for several folds where those do not change them.
         report: told about progress.
         early_samples: held-out samples for early decision; none if 0.
         workers: learn and encode; see `make_features`.
@@ -57,7 +58,8 @@ def run_cells(
         InputError: something in the setting does not fit the data.
     """
     cell = cells[0]
-    with data.open(cell.fold) as recordings:
+    fold = None if cell.has_features_of_all_folds else cell.fold
+    with data.open(fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
             features = make_features(cell.method, recordings, cell.setting, report, workers)
@@ -76,17 +78,32 @@ def run_cells(
         for cell in cells:
             with PeakMemory() as training:
                 variants = cell.setting.variants
-                result = _scored(cell, data, features, samples, [others[v] for v in variants], report)
+                split = _split(samples, [others[v] for v in variants], data, cell if fold is None else None)
+                result = _scored(cell, data, features, *split, report)
                 if cell.fold == 0 and not cell.swept:
                     classifier = result["classifier"]
                     result |= _looked_into(
-                        cell, features, classifier, samples, recordings, report, early_samples
+                        cell, features, classifier, split[0], recordings, report, early_samples
                     )
             del result["classifier"]
             result["learn_s"] = round(learned - started, 3)
             result["encode_s"] = round(sum(seconds[v] for v in (PLAIN, *variants)), 3)
             result["peak_mb"] = max(making.peak_mb, training.peak_mb)
             yield cell, result
+
+
+def _split(
+    samples: EncodedSamples, others: Sequence[EncodedSamples], data: DataSet, cell: Cell | None
+) -> tuple[EncodedSamples, list[EncodedSamples]]:
+    """Samples and variants as a cell's fold holds some of them out; as they are, without a cell."""
+    held_out = data.held_out(cell.fold) if cell else None
+    if held_out is None:
+        return samples, [*others]
+    seen = ~held_out
+    return replace(samples, held_out=held_out), [
+        EncodedSamples(other.rows[seen], other.labels[seen], other.sources[seen], other.held_out[seen])
+        for other in others
+    ]
 
 
 def _scored(
@@ -104,9 +121,11 @@ def _scored(
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
     classifier: Classifier | KernelClassifier
-    classifier = linear = train_classifier(rows, labels, features, parts=parts[numbers])
-    if cell.setting.kernel == "rbf":
-        classifier = train_kernel_classifier(rows, linear, np.asarray(labels))
+    if cell.setting.kernel == "rbf":  # the linear one beside it is not scored, so it is not trained
+        beside = Classifier.untrained(labels, features)
+        classifier = train_kernel_classifier(rows, beside, np.asarray(labels))
+    else:
+        classifier = train_classifier(rows, labels, features, parts=parts[numbers])
     trained = time.perf_counter()
     report("training", 1, 1, "")
     predicted = predict_all(classifier, samples.rows[samples.held_out])
@@ -118,7 +137,7 @@ def _scored(
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
         "confusion": confusion(true, predicted, data.names),
         "features": features.n_features,
-        "C": classifier.provenance["C"],
+        "C": classifier.provenance.get("C"),
         "train_s": round(trained - started, 3),
     }
 

@@ -12,7 +12,7 @@ from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
-__all__ = ["METHODS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
+__all__ = ["METHODS", "TRAINING_PRESETS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
 
 METHODS = {
     "direct": "learned transform (direct formulation)",
@@ -36,6 +36,13 @@ _OTHERS_USE = {
     "counts": _TRAINING,
 }
 """Settings of methods that learn no filters here."""
+
+_SAME_IN_EVERY_FOLD = ("model", "counts")
+"""Methods that take nothing from the samples, so that all folds share their features."""
+
+
+TRAINING_PRESETS: dict[str, dict[str, Any]] = {"accurate": {"mirror": True, "kernel": "rbf"}}
+"""What a preset means for training, beside what it means for learning (`learn.settings.PRESETS`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +116,13 @@ class Cell:
         mine, others = (
             replace(cell.setting, mirror=False, cuts="", shift=0, kernel="linear") for cell in (self, other)
         )
-        return (self.method, self.fold, mine) == (other.method, other.fold, others)
+        same_fold = self.fold == other.fold or self.has_features_of_all_folds
+        return same_fold and (self.method, mine) == (other.method, others)
+
+    @property
+    def has_features_of_all_folds(self) -> bool:
+        """Whether its features do not depend on which samples are held out."""
+        return self.method in _SAME_IN_EVERY_FOLD
 
 
 def parse_sweep(text: str) -> tuple[str, list[Any]]:

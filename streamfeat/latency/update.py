@@ -178,6 +178,8 @@ def _touch(engine: Engine) -> None:
     """Write to all memory of an engine without changing it."""
     for array in engine._state:
         array += 0
+    for _, scale in engine._further:
+        _touch(scale)
 
 
 def _call_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
