@@ -18,7 +18,8 @@ import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.classifier import Classifier, train_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores

@@ -226,19 +226,19 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
         """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
 
-        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`.
+        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`. Those of a second
+        scale begin with `scale_2_`, and so on.
 
         Args:
             input_features: samples have no features of their own, so it is ignored.
         """
-        halves = ("_pos", "_neg") if self.encoder.encoding == "split" else ("",)
-        cells = range(self.encoder.geometry.pooling)
         names = [
-            f"cell_{row}_{column}_{k}{half}"
-            for row in cells
-            for column in cells
-            for half in halves
-            for k in range(self.encoder.n_filters)
+            f"{f'scale_{number}_' if number > 1 else ''}cell_{row}_{column}_{k}{half}"
+            for number, scale in enumerate(self.encoder.scales, 1)
+            for row in range(scale.geometry.pooling)
+            for column in range(scale.geometry.pooling)
+            for half in (("_pos", "_neg") if scale.encoding == "split" else ("",))
+            for k in range(scale.n_filters)
         ]
         return np.array(names, object)
 

@@ -97,6 +97,7 @@ def evaluate(
     volumes: options.Volumes = None,
     iterations: options.Iterations = None,
     seed: options.Seed = None,
+    scales: options.Scales = None,
     mirror: options.Mirror = False,
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
@@ -132,7 +133,7 @@ def evaluate(
     kept beside the result: the same command goes on after an interruption.
     """
     from streamfeat.evaluate.page import check_page, write_page
-    from streamfeat.evaluate.plan import WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
+    from streamfeat.evaluate.plan import TRAINING_PRESETS, WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
     from streamfeat.evaluate.run import evaluate as run
     from streamfeat.evaluate.run import save_result, state_path
     from streamfeat.evaluate.splits import DataSet
@@ -151,6 +152,10 @@ def evaluate(
         "kernel": kernel,
         "model": str(model or ""),
     }
+    for name, value in TRAINING_PRESETS.get(preset, {}).items():
+        source = context.get_parameter_source(name)
+        if source and source.name == "DEFAULT":
+            base[name] = value
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")

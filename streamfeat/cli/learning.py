@@ -88,6 +88,7 @@ def learn(
     volumes: options.Volumes = None,
     iterations: options.Iterations = None,
     seed: options.Seed = None,
+    scales: options.Scales = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Go on from this model; recordings and all other options as it was learned with."),
@@ -129,7 +130,9 @@ def learn(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
             )
     except KeyboardInterrupt:
-        err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
+        err.print(
+            "[yellow]interrupted[/] before an iteration was done, or all scales were; nothing was written"
+        )
         raise typer.Exit(130) from None
     encoder.save(model)
     part.unlink(missing_ok=True)
@@ -138,6 +141,7 @@ def learn(
         "formulation": encoder.formulation,
         "filters": encoder.n_filters,
         "features": encoder.n_features,
+        "scales": len(encoder.scales),
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],

@@ -57,7 +57,19 @@ __all__ = [
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
+_ORDER = (
+    "demo",
+    "info",
+    "convert",
+    "simulate",
+    "learn",
+    "label",
+    "train",
+    "replay",
+    "evaluate",
+    "latency",
+    "view",
+)
 _PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 

@@ -129,6 +129,15 @@ RESULTS: dict[str, dict[str, Field]] = {
         "faults": Field("[object]", "`file`, `what` and `reason` of each"),
         "removed": _REMOVED,
     },
+    "simulate": {
+        "written": _WRITTEN,
+        "samples": Field("int", "images that were simulated; 1 for a film"),
+        "events": Field("int", "events in the file"),
+        "bytes_out": Field("int", "of the file"),
+        "failed": Field("int", "images that could not be read, or give no events", quiet=True),
+        "damaged": Field("int", "frames or parts of a film that could not be read", quiet=True),
+        "faults": Field("[object]", "`file`, `what` and `reason` of each"),
+    },
     "label": {
         "labels": Field("text?", "the label file; null if nothing was labelled", "label file"),
         "samples": Field("int", "labels in it", "labels"),
@@ -140,6 +149,7 @@ RESULTS: dict[str, dict[str, Field]] = {
         "formulation": Field("text", "`direct` or `inverse`"),
         "filters": Field("int", "filters, or atoms"),
         "features": Field("int", "numbers that an emission has"),
+        "scales": Field("int", "scales whose features stand side by side", quiet=True),
         "volumes": Field("int", "local volumes that were learned from"),
         "empty_share": Field("number", "share of volumes without events, which were left out"),
         "iterations": Field("int", "passes over them"),

@@ -121,9 +121,11 @@ def _scored(
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
     classifier: Classifier | KernelClassifier
-    classifier = linear = train_classifier(rows, labels, features, parts=parts[numbers])
-    if cell.setting.kernel == "rbf":
-        classifier = train_kernel_classifier(rows, linear, np.asarray(labels))
+    if cell.setting.kernel == "rbf":  # the linear one beside it is not scored, so it is not trained
+        beside = Classifier.untrained(labels, features)
+        classifier = train_kernel_classifier(rows, beside, np.asarray(labels))
+    else:
+        classifier = train_classifier(rows, labels, features, parts=parts[numbers])
     trained = time.perf_counter()
     report("training", 1, 1, "")
     predicted = predict_all(classifier, samples.rows[samples.held_out])
@@ -135,7 +137,7 @@ def _scored(
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
         "confusion": confusion(true, predicted, data.names),
         "features": features.n_features,
-        "C": classifier.provenance["C"],
+        "C": classifier.provenance.get("C"),
         "train_s": round(trained - started, 3),
     }
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.engine.geometry import Geometry
 from streamfeat.evaluate.plan import Trial
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
-from streamfeat.learn.fit import learn_encoder, prepare
+from streamfeat.learn.fit import geometries_of, learn_encoder, prepare
 from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import Recording
@@ -73,7 +74,24 @@ def _other_filters(
     method: str, recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers
 ) -> Encoder:
     """The pipeline of the direct formulation, with filters that solve another problem, or none."""
-    material = prepare(recordings, setting, report, workers)
+    geometries = geometries_of(setting, recordings, workers)
+    return Encoder.side_by_side(
+        [
+            _other_scale(method, recordings, one, geometry, report, workers)
+            for one, geometry in zip(setting.each, geometries, strict=True)
+        ]
+    )
+
+
+def _other_scale(
+    method: str,
+    recordings: Sequence[Recording],
+    setting: Setting,
+    geometry: Geometry,
+    report: Report,
+    workers: Workers,
+) -> Encoder:
+    material = prepare(recordings, setting, report, workers, geometry)
     rng = np.random.default_rng([setting.seed, 1])  # volumes were drawn from the seed alone
     if method == "random":
         return material.encoder(random_filters(setting.filters, material.geometry.entries, rng))

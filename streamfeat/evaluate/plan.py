@@ -12,7 +12,16 @@ from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
-__all__ = ["METHODS", "WITHOUT_KERNELS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
+__all__ = [
+    "METHODS",
+    "TRAINING_PRESETS",
+    "WITHOUT_KERNELS",
+    "Cell",
+    "Trial",
+    "parse_sweep",
+    "plan_cells",
+    "used_by",
+]
 
 METHODS = {
     "direct": "learned transform (direct formulation)",
@@ -42,6 +51,10 @@ _OTHERS_USE = {
 
 _SAME_IN_EVERY_FOLD = ("model", "counts")
 """Methods that take nothing from the samples, so that all folds share their features."""
+
+
+TRAINING_PRESETS: dict[str, dict[str, Any]] = {"accurate": {"mirror": True, "kernel": "rbf"}}
+"""What a preset means for training, beside what it means for learning (`learn.settings.PRESETS`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import encode_samples
 from streamfeat.classify.kernel import KernelClassifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.engine.encoder import FeatureMap
 from streamfeat.recordings.reader import Sample
 

@@ -65,7 +65,8 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def _geometry(setting: dict[str, Any]) -> str:
-    return f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    first = f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    return first if setting["scales"] == "none" else f"{first}+{setting['scales']}"
 
 
 def _interval(row: dict[str, Any]) -> str:
@@ -195,7 +196,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     setting = next((row["setting"] for row in base_rows(result) if "patch" in row["setting"]), None)
     if setting:
         lines.append(
-            f"Geometry is patch x patch x bins/stride, in pixels; downsample {setting['downsample']}, counts "
+            "Geometry is patch x patch x bins/stride, in pixels, and further scales, each patch@downsample; "
+            f"downsample {setting['downsample']}, counts "
             f"clipped to {setting['max_count']}, {setting['encoding']} encoding, "
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "
             "Filters are learned without labels, from samples that are not held out."

@@ -55,6 +55,7 @@ class Model:
             "bins": geometry.n_bins,
             "bin_us": geometry.bin_us,
             "downsample": geometry.downsample,
+            "scales": len(encoder.scales),
         }
 
 

@@ -43,6 +43,14 @@ def follow_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDA
         current, `(n,)` int64; and whether the event began a new bin, `(n,)` bool. The first event of an
         empty engine begins none, for there is nothing yet to move on.
     """
+    ns, begins_bin = _followed(engine, events)
+    for _, scale in engine._further:  # scale after scale, so an event took what it took in each
+        ns = ns + _followed(scale, events)[0]
+    return ns, begins_bin
+
+
+def _followed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The same for one scale."""
     engine.features()  # brings the engine up to date, as `follow` does once for each call
     stamps, bins = np.empty((2, len(events) + 1), np.int64)
     _walk(

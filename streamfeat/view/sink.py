@@ -140,7 +140,8 @@ class ViewSink:
 
     def _tell(self, e: Emission) -> None:
         assert self._encoder
-        columns = feature_columns(e.features, self._encoder.encoding, self._encoder.geometry.pooling)
+        first = e.features[self._encoder.places[0]]
+        columns = feature_columns(first, self._encoder.encoding, self._encoder.geometry.pooling)
         features = {
             "t_s": e.t_us / 1e6,
             "filters_per_column": columns.filters,
@@ -203,6 +204,7 @@ def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
         "max_count": str(geometry.max_count),
         "downsample": str(geometry.downsample),
         "pooling": str(geometry.pooling),
+        "scales": str(len(encoder.scales)),
         "labels": "\n".join(labels),
     }
 
