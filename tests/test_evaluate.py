@@ -691,8 +691,8 @@ def test_filters_are_drawn_with_their_bins_side_by_side():
     filters[0, 0] = 2.0  # bin 0, first row, first column
     filters[8, -1] = -0.5  # bin 1, last row, last column
     picture = tiled(filters, (2, 2, 3))
-    tile = np.full((2, 7), 128)
-    tile[:, 3] = 255  # the gap between bins
+    tile = np.full((2, 7), 128.0)
+    tile[:, 3] = np.nan  # the gap between bins, the page behind it
     first, last = tile.copy(), tile.copy()
     first[0, 0], last[1, 6] = 255, 1
     np.testing.assert_array_equal(picture[:2, :7], first)

@@ -148,14 +148,18 @@ RESULTS: dict[str, dict[str, Field]] = {
         "written": _WRITTEN,
         "formulation": Field("text", "`direct` or `inverse`"),
         "filters": Field("int", "filters, or atoms"),
-        "features": Field("int", "numbers that an emission has"),
+        "features": Field("int", "numbers that an emission has", "numbers per emission"),
         "scales": Field("int", "scales whose features stand side by side", quiet=True),
-        "volumes": Field("int", "local volumes that were learned from"),
-        "empty_share": Field("number", "share of volumes without events, which were left out"),
+        "volumes": Field("int", "local volumes that were learned from", "patches learned from"),
+        "empty_share": Field(
+            "number", "share of volumes without events, which were left out", "patches without events"
+        ),
         "iterations": Field("int", "passes over them"),
-        "objective": Field("[number]", "objective at the first and at the last iteration"),
-        "condition": Field("number", "condition number of the learned matrix; 1 is best"),
-        "coherence": Field("number", "largest likeness of two filters, 0 to 1"),
+        "objective": Field(
+            "[number]", "objective at the first and at the last iteration", "error and penalty"
+        ),
+        "condition": Field("number", "condition number of the learned matrix; 1 is best", hidden=True),
+        "coherence": Field("number", "largest likeness of two filters, 0 to 1", hidden=True),
         "unused": Field("int", "filters that no volume uses", quiet=True),
         "bytes": Field("int", "of the file"),
         "log_determinant": Field(
@@ -363,7 +367,9 @@ def _text(name: str, value: Any) -> str:
         count = f", {value['messages']:,} messages" if value["messages"] or value["schema_encoding"] else ""
         return f"{value['name']} ({value['schema']}{count})"
     if name == "objective":
-        return f"{value[0]:.6g} to {value[-1]:.6g}"
+        return f"{value[0]:.6g} at first, {value[-1]:.6g} at last"
+    if name == "empty_share":
+        return f"{100 * value:.0f} %"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):

@@ -28,7 +28,7 @@ METHODS = {
     "inverse": "learned dictionary (inverse formulation)",
     "kmeans": "spherical k-means filters",
     "random": "random filters",
-    "model": "a model that was learned before",
+    "model": "a model that was learned before, the general one that ships without -m",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
     "counts": "count images",

@@ -48,11 +48,12 @@ def base_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def cells(row: dict[str, Any]) -> list[str]:
     """A row of the accuracy table, as many as `COLUMNS`."""
-    setting = row["setting"]
+    setting, learned = row["setting"], row.get("learned")
+    filters = setting.get("filters") or (learned["n_filters"] if learned else None)
     return [
         row["method"],
-        f"{setting['filters']:,}" if "filters" in setting else "",
-        _geometry(setting) if "patch" in setting else "",
+        f"{filters:,}" if filters else "",
+        _geometry(setting) if "patch" in setting else _shape(learned) if learned else "",
         f"{row['features']:,}",
         f"{row['accuracy']:.3f}",
         _interval(row),
@@ -67,6 +68,11 @@ def cells(row: dict[str, Any]) -> list[str]:
 def _geometry(setting: dict[str, Any]) -> str:
     first = f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
     return first if setting["scales"] == "none" else f"{first}+{setting['scales']}"
+
+
+def _shape(learned: dict[str, Any]) -> str:
+    bins, patch, _ = learned["shape"]
+    return f"{patch}x{patch}x{bins}"
 
 
 def _interval(row: dict[str, Any]) -> str:
