@@ -495,6 +495,25 @@ def test_events_that_cannot_be_are_counted(run, home, tmp_path):
     assert (said["events"], said["rejected"], said["late"]) == (540, 2, 0)
 
 
+def test_a_resolution_that_changes_midway_is_told(run, tmp_path):
+    sizes = [(34, 34), (34, 34), (20, 40), (34, 34), (12, 16), (30, 31), (30, 32)]
+    parts = [
+        tiny.packet(tiny.steady(i * 10_000, (i + 1) * 10_000, 20, i, size), size)
+        for i, size in enumerate(sizes, 1)
+    ]
+    one, several = tmp_path / "one.mcap", tmp_path / "several.mcap"
+    tiny.write_items(one, parts[:2])
+    tiny.write_items(several, parts)
+    assert run("info", one, "--json").json["other_resolutions"] == []
+    assert "also" not in run("info", one).out
+    said = run("info", several, "--json").json
+    assert said["resolution"] == [34, 34]
+    assert said["other_resolutions"][0] == {"resolution": [20, 40], "packets": 1}
+    assert [other["resolution"] for other in said["other_resolutions"][1:]] == [[12, 16], [30, 31], [30, 32]]
+    table = run("info", several).out
+    assert "40x20 (1 packets), 16x12 (1 packets), 31x30 (1 packets) and 1 others" in table
+
+
 def test_a_damaged_chunk_costs_only_itself(run, home, tmp_path):
     path = tmp_path / "damaged.mcap"
     with RecordingWriter(path, chunk_size=4096, compression="none") as writer:

@@ -100,6 +100,11 @@ def info(
             "read": rec.topic,
             "encoding": rec.encoding,
             "resolution": list(rec.resolution),
+            "other_resolutions": [
+                {"resolution": list(size), "packets": n}
+                for size, n in rec.resolutions.items()
+                if size != rec.resolution
+            ],
             "events": n_events,
             "on": rec.n_on,
             "off": rec.n_off,

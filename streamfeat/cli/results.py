@@ -77,6 +77,11 @@ RESULTS: dict[str, dict[str, Field]] = {
         "read": Field("text", "the event topic that is read", "topic read"),
         "encoding": Field("text", "of its packets"),
         "resolution": Field("[int]", "height and width of the sensor, in pixels"),
+        "other_resolutions": Field(
+            "[object]",
+            "`resolution` and `packets` of what has another: its own crop, or a change midway",
+            "also",
+        ),
         "events": Field("int", "events that can be used"),
         "on": Field("int", "ON events", "ON"),
         "off": Field("int", "OFF events", "OFF"),
@@ -366,6 +371,10 @@ def _text(name: str, value: Any) -> str:
         # A camera file has a format instead, and no messages.
         count = f", {value['messages']:,} messages" if value["messages"] or value["schema_encoding"] else ""
         return f"{value['name']} ({value['schema']}{count})"
+    if isinstance(value, Mapping) and value.keys() == {"resolution", "packets"}:
+        return f"{_text('resolution', value['resolution'])} ({value['packets']:,} packets)"
+    if name == "other_resolutions" and len(value) > 3:
+        return f"{_text(name, value[:3])} and {len(value) - 3} others"
     if name == "objective":
         return f"{value[0]:.6g} at first, {value[-1]:.6g} at last"
     if name == "empty_share":
