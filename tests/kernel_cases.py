@@ -890,6 +890,27 @@ GATHER_VOLUME = {
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
 
+# Pixels of a simulated camera.
+
+
+FIRE_PIXELS = {
+    "nothing fires": lambda call: call.result[1] == 0 and call.result[0] == len(call.before),
+    "some fire": lambda call: call.result[1] > 0,
+    "there is no room for one": lambda call: call.result[0] < len(call.before),
+    "there is no room after some": lambda call: call.result[1] > 0 and call.result[0] < len(call.before),
+    "a reset that ends between the frames": lambda call: (
+        (call.release > call.start) & (call.release < call.end)
+    ).any(),
+    "a reset that ends with the frame": lambda call: (call.release == call.end).any(),
+    "a reset that goes on": lambda call: (call.release > call.end).any(),
+    "light that stays": lambda call: (call.before == call.after).any(),
+    "light that rises and light that falls": lambda call: (
+        (call.before < call.after).any() and (call.before > call.after).any()
+    ),
+    "more events than pixels": lambda call: call.result[1] > len(call.before),
+    "not from the first pixel on": lambda call: call.pixel > 0,
+}
+
 # Time surfaces.
 
 
@@ -1047,6 +1068,7 @@ CASES = {
     "renew": RENEW,
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
+    "fire_pixels": FIRE_PIXELS,
     "add_memory_surfaces": MEMORY_SURFACES,
     "time_surfaces": TIME_SURFACES,
 }

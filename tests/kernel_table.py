@@ -26,6 +26,7 @@ from streamfeat.kernels import (
     follow,
     ingest,
     lasso,
+    pixels,
     planes,
     surfaces,
     update,
@@ -1142,6 +1143,27 @@ def _surface_events(rng, height, width, n):
     return x, y, rng.integers(0, 2, n), t
 
 
+def make_draw_picture(rng):
+    tall, wide, height, width = rng.integers(1, 9, 4)
+    lines = rng.integers(0, tall, (height, 4)), rng.integers(0, wide, (width, 4))
+    weights = rng.random((height, 4)), rng.random((width, 4))
+    out = np.empty((height, width))
+    return rng.random((tall, wide)), lines[0], weights[0], lines[1], weights[1], np.empty(wide), out
+
+
+def make_fire_pixels(rng):
+    n, room = int(rng.integers(1, 30)), int(rng.choice([0, 2, 9, 400]))
+    before, steps = rng.integers(-9, 9, n) / 8, rng.choice([0, -1, 1, 3, -4, 9], n) / 8
+    start = float(rng.integers(0, 10_000))
+    end = start + float(rng.choice([1, 50, 4_000]))
+    thresholds = rng.integers(1, 4, (2, n)) / 16
+    release = start + rng.choice([-5.0, 0.0, 0.5, end - start, 9_000.0], n)
+    state = before + rng.integers(-1, 2, n) / 32, release
+    outs = (np.zeros(room, np.int64) for _ in range(3))
+    refractory = float(rng.choice([0, 1, 30, 1_000]))
+    return before, before + steps, start, end, thresholds, refractory, *state, int(rng.integers(0, n)), *outs
+
+
 def make_add_memory_surfaces(rng):
     height, width, cell = rng.integers(3, 12, 3)
     radius = int(rng.integers(0, 4))
@@ -1263,6 +1285,8 @@ KERNELS = [
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
     Row(follow.trace, make_trace, exact_but_features),
+    Row(pixels.draw_picture, make_draw_picture),
+    Row(pixels.fire_pixels, make_fire_pixels),
     Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),
     Row(surfaces.time_surfaces, make_time_surfaces, close_surfaces),
     Row(volume.add_column, make_add_column),

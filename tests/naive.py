@@ -986,6 +986,60 @@ def _alone(left, places, t, support, latest, level):
     return noise
 
 
+# streamfeat.kernels.pixels
+
+
+def draw_picture(picture, rows, row_weights, columns, column_weights, scratch, out):
+    by_row = (row_weights[:, :, None] * picture[rows]).transpose(1, 0, 2)
+    by_row = (by_row[0] + by_row[1]) + (by_row[2] + by_row[3])
+    by_column = (by_row[:, columns] * column_weights).transpose(2, 0, 1)
+    out[:] = (by_column[0] + by_column[1]) + (by_column[2] + by_column[3])
+    scratch[:] = by_row[-1]
+
+
+def fire_pixels(
+    before,
+    after,
+    start,
+    end,
+    thresholds,
+    refractory,
+    reference,
+    release,
+    pixel,
+    out_pixel,
+    out_polarity,
+    out_t,
+):
+    # All pixels at once, as arrays: what it was before it was a kernel.
+    off, on = thresholds
+    live = np.arange(len(before)) >= pixel
+    slope = (after - before) / (end - start)
+    ends = live & (release > start) & (release <= end)
+    moved = np.where(ends, before + slope * (release - start), reference)
+    change = after - moved
+    fires = ((change >= on) | (change <= -off)) & live & (release <= end) & (slope != 0)
+    which = np.flatnonzero(fires)
+    slopes, rising = slope[which], slope[which] > 0
+    step = np.where(rising, on[which], -off[which])
+    first = np.clip(start + (moved[which] + step - before[which]) / slopes, start, end)
+    period = refractory + step / slopes
+    count = np.floor((end - first) / period).astype(np.int64) + 1
+    fits = np.cumsum(count) <= len(out_t)
+    n_fit = int(np.argmin(fits)) if not fits.all() else len(fits)
+    stop = int(which[n_fit]) if n_fit < len(which) else len(before)
+    seen = np.arange(len(before)) < stop + (n_fit < len(which))  # that pixel's reset ended as well
+    reference[:] = np.where(seen, moved, reference)
+    which, count, first, period, rising = (a[:n_fit] for a in (which, count, first, period, rising))
+    n = int(count.sum())
+    nth = np.arange(n) - np.repeat(np.cumsum(count) - count, count)
+    out_pixel[:n], out_polarity[:n] = np.repeat(which, count), np.repeat(rising, count)
+    out_t[:n] = (np.repeat(first, count) + nth * np.repeat(period, count)).astype(np.int64)
+    release[which] = first + (count - 1) * period + refractory
+    reference[which] = before[which] + slope[which] * (release[which] - start)
+    return stop, n
+
+
 # streamfeat.kernels.surfaces
 
 

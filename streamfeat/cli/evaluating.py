@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    compile_first,
     err,
     out,
     print_json,
@@ -143,7 +144,7 @@ def evaluate(
     kept beside the result: the same command goes on after an interruption.
     """
     from streamfeat.evaluate.page import check_page, write_page
-    from streamfeat.evaluate.plan import TRAINING_PRESETS, Trial, parse_sweep, plan_cells
+    from streamfeat.evaluate.plan import TRAINING_PRESETS, WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
     from streamfeat.evaluate.run import evaluate as run
     from streamfeat.evaluate.run import read_result, save_result, state_path
     from streamfeat.evaluate.splits import DataSet
@@ -182,6 +183,8 @@ def evaluate(
             data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups, reading)
             print_assumptions(data.assumptions)
             report("reading labels", 1, 1, "")
+            if not WITHOUT_KERNELS.issuperset(methods):
+                compile_first(quiet=quiet)
             result = run(
                 data,
                 plan_cells(methods, base, parsed, data.n_folds),

@@ -24,6 +24,7 @@ from streamfeat.cli.program import (
     ThreadsOption,
     TopicOption,
     app,
+    compile_first,
     completing,
     err,
     model_or_general,
@@ -111,6 +112,7 @@ def latency(
         threads=threads,
     )
     print_assumptions(report.assumptions)
+    compile_first(quiet=quiet)
     try:
         with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")

@@ -56,6 +56,7 @@ __all__ = [
     "WebPortOption",
     "WorkersOption",
     "app",
+    "compile_first",
     "completing",
     "err",
     "out",
@@ -64,11 +65,23 @@ __all__ = [
     "print_result",
     "progress_bars",
     "refuse_existing",
+    "tell_compiling",
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
-_PIPE_COLUMNS = 1_000
+_ORDER = (
+    "demo",
+    "info",
+    "convert",
+    "simulate",
+    "learn",
+    "label",
+    "train",
+    "replay",
+    "evaluate",
+    "latency",
+    "view",
+)
 _PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
@@ -322,6 +335,25 @@ def model_or_general(model: Path | None) -> Path:
             soft_wrap=True,
         )
     return model or GENERAL_MODEL
+
+
+def compile_first(*, quiet: bool) -> None:
+    """Compile the kernels that every encoder needs, on two cores; nothing where that was done before."""
+    from streamfeat.stream.compiling import compile_together
+
+    tell_compiling(quiet=quiet)
+    compile_together()
+
+
+def tell_compiling(*, quiet: bool) -> None:
+    """Say why nothing else is said for half a minute, where kernels were not compiled before."""
+    from streamfeat.stream.compiling import is_compiled
+
+    if not quiet and not is_compiled():
+        err.print(
+            "[dim]compiling:[/] kernels, once for this version; it takes half a minute or more",
+            soft_wrap=True,
+        )
 
 
 def print_losses(losses: "Losses") -> None:

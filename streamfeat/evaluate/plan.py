@@ -12,7 +12,16 @@ from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
-__all__ = ["METHODS", "TRAINING_PRESETS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
+__all__ = [
+    "METHODS",
+    "TRAINING_PRESETS",
+    "WITHOUT_KERNELS",
+    "Cell",
+    "Trial",
+    "parse_sweep",
+    "plan_cells",
+    "used_by",
+]
 
 METHODS = {
     "direct": "learned transform (direct formulation)",
@@ -25,6 +34,9 @@ METHODS = {
     "counts": "count images",
 }
 """Every method, and what it is."""
+
+WITHOUT_KERNELS = frozenset({"hats", "hots", "counts"})
+"""Methods that have no encoder, and so nothing to compile first."""
 
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}

@@ -126,6 +126,30 @@ def _peers(part: dict[str, Any]) -> str:
     )
 
 
+def _cameras(part: dict[str, Any]) -> str:
+    if set(part) == {"missing"}:
+        return ""
+    rows = [
+        (
+            f"{found['resolution'][1]}x{found['resolution'][0]}",
+            name.replace("ours", "streamfeat"),
+            _time(figure),
+            _over(found["over_ours"][name]) + " x" if name in found["over_ours"] else "",
+        )
+        for found in part.values()
+        for name, figure in found["race"]["ns"].items()
+    ]
+    events = ", ".join(f"{found['events_per_emission']:,}" for found in part.values())
+    differences = [found["largest_difference"] for found in part.values() if found["largest_difference"]]
+    agreement = f" Its features are ours to {max(differences):.1g} of the largest." if differences else ""
+    return (
+        f"**Cameras**: an emission every 10 ms, K = 400, stride 4, `split`, {events} events each. PyTorch is "
+        f"given its frames; one thread is timed by the processor, several by the clock.{agreement}\n\n"
+        + _table(("sensor", "", "time an emission", "slower"), rows)
+        + _missing(next(iter(part.values())))
+    )
+
+
 def _inverse(part: dict[str, Any]) -> str:
     rows = [
         (
@@ -276,6 +300,7 @@ def _missing(part: dict[str, Any]) -> str:
 TABLES = {
     "floors": _floors,
     "peers": _peers,
+    "cameras": _cameras,
     "inverse": _inverse,
     "ingest": _ingest,
     "latency": _latency,

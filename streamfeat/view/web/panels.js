@@ -131,7 +131,7 @@ function drawAll() {
       `stride ${about.stride}, ${about.bins} bins of ${ms(binMs)}`;
     at("bins-note").textContent = `signed counts, clipped at ±${about.max_count}, in each time bin`;
   }
-  at("volumes-note").textContent = engine ? `${engine.active_volumes} of ${engine.volumes}` : "";
+  at("volumes-note").textContent = engine ? `${engine.active_volumes.toLocaleString("en")} of ${engine.volumes.toLocaleString("en")}` : "";
   panel("events", events, (canvas) => drawPicture(canvas, events, signedColours()));
   panel("bins", bins && about?.bins, (canvas) => {
     const n = Number(about.bins);
@@ -143,10 +143,11 @@ function drawAll() {
   });
   panel("volumes", volumes, (canvas) => drawPicture(canvas, volumes, plainColours()));
   panel("features", features && about?.filters, (canvas) => drawFeatures(canvas, features));
-  drawScores(last.prediction);
+  drawScores(last.prediction, startS);
   panel("latency", model.latency.length, (canvas) =>
     drawLines(canvas, {
-      points: model.latency,
+      points: fromStart(model.latency, startS),
+      time: `${model.absolute ? "camera" : "stream"} time (s)`,
       colours: [colour("accent"), colour("off")],
       unit: "time, log scale",
       logarithmic: true,
@@ -183,7 +184,10 @@ function leaders(labels) {
   return most.map(([i]) => i).sort((a, b) => a - b);
 }
 
-function drawScores(prediction) {
+/** Points whose time is counted from a start, as in the head of the page. */
+const fromStart = (points, startS) => points.map((point) => ({ ...point, t: point.t - startS }));
+
+function drawScores(prediction, startS) {
   const { about } = model;
   if (about && !about.labels.length) {
     at("legend").replaceChildren();
@@ -205,7 +209,8 @@ function drawScores(prediction) {
     strips.unshift({ name: "label", colours: model.scores.map(({ truth }) => of.get(truth) ?? null) });
   }
   drawLines(at("scores"), {
-    points: model.scores.map((point) => ({ ...point, values: order.map((i) => point.values[i]) })),
+    points: fromStart(model.scores, startS).map((point) => ({ ...point, values: order.map((i) => point.values[i]) })),
+    time: `${model.absolute ? "camera" : "stream"} time (s)`,
     colours: order.map((i) => of.get(labels[i]) ?? colour("line")),
     unit: "score",
     strips,
