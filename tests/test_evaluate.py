@@ -217,7 +217,7 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear"}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear", "test_mirror": False}
     assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 
