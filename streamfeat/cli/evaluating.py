@@ -57,7 +57,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
