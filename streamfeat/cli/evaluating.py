@@ -192,7 +192,7 @@ def evaluate(
                 report=report,
                 workers=place,
                 against=earlier,
-                finished=lambda row: None if quiet else err.print(_in_short(row)),
+                finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
         how = (
