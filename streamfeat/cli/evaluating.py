@@ -57,7 +57,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
@@ -102,6 +102,12 @@ def evaluate(
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
+    test_mirror: Annotated[
+        bool,
+        typer.Option(
+            "--test-mirror", help="Add the scores of the mirror image of each sample that is scored."
+        ),
+    ] = False,
     on: Annotated[
         str,
         typer.Option(
@@ -114,6 +120,10 @@ def evaluate(
     early_samples: Annotated[
         int, typer.Option(help="Held-out samples for early decision, at most; 0 leaves it out.")
     ] = 500,
+    against: Annotated[
+        Path | None,
+        typer.Option(help="An earlier result of the same samples, .json: differences to its first row."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result to write, as JSON; makes runs resume.")
     ] = None,
@@ -135,7 +145,7 @@ def evaluate(
     from streamfeat.evaluate.page import check_page, write_page
     from streamfeat.evaluate.plan import TRAINING_PRESETS, WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
     from streamfeat.evaluate.run import evaluate as run
-    from streamfeat.evaluate.run import save_result, state_path
+    from streamfeat.evaluate.run import read_result, save_result, state_path
     from streamfeat.evaluate.splits import DataSet
 
     if early_samples < 0:
@@ -145,11 +155,13 @@ def evaluate(
             refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
+    earlier = read_result(against) if against else None
     base = options.setting_given(context) | {
         "mirror": mirror,
         "cuts": cuts,
         "shift": shift,
         "kernel": kernel,
+        "test_mirror": test_mirror,
         "model": str(model or ""),
     }
     for name, value in TRAINING_PRESETS.get(preset, {}).items():
@@ -179,7 +191,8 @@ def evaluate(
                 state=state_path(output) if output else None,
                 report=report,
                 workers=place,
-                finished=lambda row: None if quiet else err.print(_in_short(row)),
+                against=earlier,
+                finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
         how = (
@@ -210,12 +223,17 @@ def _in_short(row: dict[str, Any]) -> str:
         to, difference = "base" if row["swept"] else "the first", row["difference"]
         low, high = difference["low"], difference["high"]
         line += f", to {to} {difference['accuracy']:+.4f} ({low:+.4f} to {high:+.4f})"
+    if "against" in row:
+        difference = row["against"]
+        low, high = difference["low"], difference["high"]
+        line += f", to the earlier one {difference['accuracy']:+.4f} ({low:+.4f} to {high:+.4f})"
     return f"[dim]{escape(line)}[/]"
 
 
 def _print(result: dict[str, Any]) -> None:
     from streamfeat.evaluate.tables import (
         COLUMNS,
+        against_table,
         base_rows,
         cells,
         confusion_table,
@@ -233,6 +251,9 @@ def _print(result: dict[str, Any]) -> None:
         print_table(out, "accuracy of each fold", header, rows)
     for name, (header, rows) in sweep_tables(result):
         print_table(out, f"sweep of {name.replace('_', ' ')}", header, rows)
+    header, rows = against_table(result)
+    if rows:
+        print_table(out, "to the first row of the earlier result", header, rows)
     header, rows = early_table(result)
     if rows:
         print_table(out, "early decision", header, rows)
