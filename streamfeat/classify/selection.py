@@ -4,8 +4,8 @@ Lives here: ranking the filters of an encoder by a classifier's weights, and the
 Not here: learning filters (`learn`), training the classifier (`classifier`).
 
 One step of the recursive elimination of Guyon, Weston, Barnhill and Vapnik (2002), section 4: a feature
-counts as much as the square of its weight. We deviate: the features of a filter, its cells and signs, stay or go
-together, so that the model gets smaller and not only its feature vector; and all are dropped at once.
+counts as much as the square of its weight. We deviate: the features of a filter, its cells and signs, stay
+or go together, so that the model gets smaller and not only its feature vector; and all are dropped at once.
 """
 
 import numpy as np
