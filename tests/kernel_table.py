@@ -28,6 +28,7 @@ from streamfeat.kernels import (
     lasso,
     pixels,
     planes,
+    spiking,
     surfaces,
     update,
     volume,
@@ -1180,6 +1181,35 @@ def make_time_surfaces(rng):
     return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
 
 
+def _neurons(rng):
+    """Events, and the shapes of neurons and of cells of a few pixels."""
+    height, width, cell, n_orientations = (int(rng.integers(1, most)) for most in (9, 9, 5, 5))
+    x, y, p, t = _surface_events(rng, height, width, random_length(rng, 60))
+    cells = -(-height // cell), -(-width // cell), n_orientations
+    return (x, y, p, t), (2, height, width, n_orientations), cells, cell, 2 * int(rng.integers(0, 3)) + 1
+
+
+def make_spike_first(rng):
+    (x, y, p, t), neurons, cells, cell, side = _neurons(rng)
+    weights = rng.integers(-60, 100, (side, side, neurons[3])).astype(np.int32)
+    limits = np.array([rng.choice([60, 150]), rng.choice([0, 25]), *rng.choice([0, 5], 2), cell], np.int64)
+    potential = rng.integers(-80, 60, neurons).astype(np.int32)
+    updated, fired, pooled = (
+        np.full(shape, past)
+        for shape, past in ((neurons[:3], 0), (neurons[:3], BEFORE_TIME), (cells, BEFORE_TIME))
+    )
+    t = np.floor(t * 10).astype(np.int64)
+    return x, y, p, t, weights, limits, potential, updated, fired, pooled, np.zeros(cells, np.int64)
+
+
+def make_spike_leaky(rng):
+    events, neurons, cells, cell, side = _neurons(rng)
+    weights = rng.uniform(-60, 100, (side, side, neurons[3]))
+    numbers = float(rng.choice([60, 150])), float(rng.choice([0.0, 0.3])), cell
+    state = rng.uniform(-80, 60, neurons), np.zeros(neurons[:3]), np.full(neurons, -np.inf)
+    return *events, weights, *numbers, *state, np.zeros(cells, np.int64)
+
+
 def close_surfaces(kernel: Run, twin: Run) -> None:
     """Powers of e may differ in their last bits."""
     for mine, yours in zip(kernel.after, twin.after, strict=True):
@@ -1287,6 +1317,8 @@ KERNELS = [
     Row(follow.trace, make_trace, exact_but_features),
     Row(pixels.draw_picture, make_draw_picture),
     Row(pixels.fire_pixels, make_fire_pixels),
+    Row(spiking.spike_first, make_spike_first),
+    Row(spiking.spike_leaky, make_spike_leaky, close_surfaces),
     Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),
     Row(surfaces.time_surfaces, make_time_surfaces, close_surfaces),
     Row(volume.add_column, make_add_column),

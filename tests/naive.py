@@ -1040,6 +1040,52 @@ def fire_pixels(
     return stop, n
 
 
+# streamfeat.kernels.spiking
+
+
+def _receivers(x, y, weights, height, width):
+    """Pixels whose neurons an event reaches, each with its weights: those of the event as seen from there."""
+    radius = weights.shape[0] // 2
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            row, column = y - dy, x - dx
+            if 0 <= row < height and 0 <= column < width:
+                yield row, column, weights[dy + radius, dx + radius]
+
+
+def spike_first(x, y, p, t, weights, limits, potential, updated, fired, pooled, counts):
+    threshold, leak, dead, pooled_dead, cell = limits.tolist()
+    for xi, yi, pi, ti in zip(x.tolist(), y.tolist(), p.tolist(), t.tolist(), strict=True):
+        for row, column, weight in _receivers(xi, yi, weights, *potential.shape[1:3]):
+            if ti - fired[pi, row, column] <= dead:
+                continue
+            here = potential[pi, row, column].astype(int)
+            leaked = leak * (ti - updated[pi, row, column])
+            here = np.sign(here) * np.maximum(np.abs(here) - leaked, 0) + weight
+            updated[pi, row, column] = ti
+            spikes = np.flatnonzero(here > threshold)
+            for k in spikes:
+                at = row // cell, column // cell, k
+                if ti - pooled[at] > pooled_dead:
+                    pooled[at] = ti
+                    counts[at] += 1
+            if len(spikes):
+                fired[pi, row, column] = ti
+            potential[pi, row, column] = 0 if len(spikes) else here
+
+
+def spike_leaky(x, y, p, t, weights, threshold, dead, cell, potential, updated, fired, counts):
+    for xi, yi, pi, ti in zip(x.tolist(), y.tolist(), p.tolist(), t.tolist(), strict=True):
+        for row, column, weight in _receivers(xi, yi, weights, *potential.shape[1:3]):
+            here = potential[pi, row, column] * math.exp(updated[pi, row, column] - ti)
+            updated[pi, row, column] = ti
+            here = here + np.where(ti - fired[pi, row, column] >= dead, weight, 0.0)
+            spikes = here >= threshold
+            fired[pi, row, column, spikes] = ti
+            counts[row // cell, column // cell] += spikes
+            potential[pi, row, column] = np.where(spikes, 0.0, here)
+
+
 # streamfeat.kernels.surfaces
 
 

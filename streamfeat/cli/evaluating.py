@@ -6,13 +6,11 @@ Not here: the evaluation (`streamfeat.evaluate`).
 
 import shlex
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from streamfeat.cli import options
 from streamfeat.cli.program import (
@@ -29,11 +27,12 @@ from streamfeat.cli.program import (
     err,
     out,
     print_json,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
+from streamfeat.cli.tables import print_table
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
@@ -251,33 +250,22 @@ def _print(result: dict[str, Any]) -> None:
     )
 
     columns = [column.replace(", ", ",\n").replace("% ", "%\n") for column in COLUMNS]
-    _show("accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
+    print_table(out, "accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
     header, rows = fold_table(result)
     if rows:
-        _show("accuracy of each fold", header, rows)
+        print_table(out, "accuracy of each fold", header, rows)
     for name, (header, rows) in sweep_tables(result):
-        _show(f"sweep of {name.replace('_', ' ')}", header, rows)
+        print_table(out, f"sweep of {name.replace('_', ' ')}", header, rows)
     header, rows = against_table(result)
     if rows:
-        _show("to the first row of the earlier result", header, rows)
+        print_table(out, "to the first row of the earlier result", header, rows)
     header, rows = early_table(result)
     if rows:
-        _show("early decision", header, rows)
+        print_table(out, "early decision", header, rows)
     header, rows = online_table(result)
     if rows:
-        _show("online, predicting before learning", header, rows)
+        print_table(out, "online, predicting before learning", header, rows)
     for row in base_rows(result) if len(result["labels"]) <= _WIDEST_CONFUSION else []:
-        _show(f"confusion of {row['method']}", *confusion_table(row, result["labels"]))
+        print_table(out, f"confusion of {row['method']}", *confusion_table(row, result["labels"]))
     for note in notes(result):
         out.print(f"[yellow]{escape(note)}[/]" if note.startswith("WARNING") else f"[dim]{escape(note)}[/]")
-
-
-def _show(
-    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)
-) -> None:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for i, column in enumerate(header):
-        table.add_column(escape(column), justify="left" if i in left else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    out.print(table)

@@ -31,10 +31,10 @@ from streamfeat.cli.program import (
     model_or_general,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
 

@@ -33,11 +33,11 @@ from streamfeat.cli.program import (
     print_json,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
     tell_compiling,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import (
     HotPixels,
     Isolated,

@@ -28,10 +28,10 @@ from streamfeat.cli.program import (
     out,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
     tell_compiling,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 
 if TYPE_CHECKING:

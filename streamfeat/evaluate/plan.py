@@ -31,6 +31,8 @@ METHODS = {
     "model": "a model that was learned before",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
+    "hfirst": "HFirst, first spikes of oriented neurons",
+    "gabor-snn": "Gabor-SNN, spikes of leaky oriented neurons",
     "counts": "count images",
 }
 """Every method, and what it is."""
@@ -45,6 +47,8 @@ _OTHERS_USE = {
     "model": ("model", *_TRAINING),
     "hats": _TRAINING,
     "hots": ("seed", *_TRAINING),
+    "hfirst": _TRAINING,
+    "gabor-snn": _TRAINING,
     "counts": _TRAINING,
 }
 """Settings of methods that learn no filters here."""
