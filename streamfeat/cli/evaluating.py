@@ -102,6 +102,10 @@ def evaluate(
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
+    select: Annotated[
+        int,
+        typer.Option(help="Learn so many times as many filters, and let labels choose those that are kept."),
+    ] = 1,
     test_mirror: Annotated[
         bool,
         typer.Option(
@@ -162,6 +166,7 @@ def evaluate(
         "shift": shift,
         "kernel": kernel,
         "test_mirror": test_mirror,
+        "select": select,
         "model": str(model or ""),
     }
     for name, value in TRAINING_PRESETS.get(preset, {}).items():

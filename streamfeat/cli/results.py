@@ -173,6 +173,9 @@ RESULTS: dict[str, dict[str, Field]] = {
     },
     "train": {
         "written": _WRITTEN,
+        "selected_model": Field(
+            "text?", "with --select: the model of the filters that were kept", quiet=True
+        ),
         "labels": Field("[text]", "names of the classes"),
         "kernel": Field("text", "`linear` or `rbf`"),
         "samples": Field("int", "samples that were trained on"),

@@ -16,6 +16,7 @@ from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.classify.folds import assign_folds
 from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
+from streamfeat.classify.selection import with_best_filters
 from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
@@ -66,7 +67,7 @@ def run_cells(
     with data.open(fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
-            features = make_features(cell.method, recordings, cell.setting, report, workers)
+            features = _features(cell, data, recordings, report, workers)
             learned = time.perf_counter()
             _compile(features, recordings)
             compiled = time.perf_counter()
@@ -104,6 +105,29 @@ def run_cells(
             result["encode_s"] = round(sum(seconds[v] for v in encoded), 3)
             result["peak_mb"] = max(making.peak_mb, training.peak_mb)
             yield cell, result
+
+
+def _features(
+    cell: Cell, data: DataSet, recordings: Sequence[Recording], report: Report, workers: Workers
+) -> FeatureMap:
+    """Learn what the method learns; of more filters than are wanted, labels choose."""
+    setting, times = cell.setting, cell.setting.select
+    if times == 1:
+        return make_features(cell.method, recordings, setting, report, workers)
+    many = replace(setting, filters=times * setting.filters, select=1)
+    features = make_features(cell.method, recordings, many, report, workers)
+    assert isinstance(features, Encoder)  # of the methods that are told how many filters
+    samples = encode_recordings(features, recordings, report, workers=workers)
+    rows, labels, _ = training_set(samples)
+    parts = assign_folds(
+        labels, samples.sources[~samples.held_out].tolist(), _INNER_FOLDS, data.groups, data.seed
+    )
+    report("choosing filters", 0, 1, f"{setting.filters:,} of {features.n_filters:,}")
+    chosen = with_best_filters(
+        features, train_classifier(rows, labels, features, parts=parts), setting.filters
+    )
+    report("choosing filters", 1, 1, "")
+    return chosen
 
 
 def _split(

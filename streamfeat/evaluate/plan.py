@@ -53,6 +53,9 @@ _OTHERS_USE = {
 }
 """Settings of methods that learn no filters here."""
 
+_MOST_TIMES = 16
+"""As many filters that may be learned to choose from."""
+
 _SAME_IN_EVERY_FOLD = ("model", "counts")
 """Methods that take nothing from the samples, so that all folds share their features."""
 
@@ -72,6 +75,7 @@ class Trial(Setting):
         shift: pixels by which samples are moved to each side to be trained on as well.
         kernel: `linear`, or `rbf`.
         test_mirror: add the scores of the mirror image of a sample that is scored.
+        select: so many times as many filters are learned, of which the labels of training samples choose.
     """
 
     model: str = ""
@@ -80,11 +84,16 @@ class Trial(Setting):
     shift: int = 0
     kernel: str = "linear"
     test_mirror: bool = False
+    select: int = 1
 
     def __post_init__(self) -> None:
         """Check the kernel, and all that `Setting` checks."""
         if self.kernel not in ("linear", "rbf"):
             raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
+        if not 1 <= self.select <= _MOST_TIMES:
+            raise InputError(f"select is {self.select}, it must be from 1 to {_MOST_TIMES}")
+        if self.select > 1 and self.scales != "none":
+            raise InputError("filters are chosen among those of one scale; leave out --select or --scales")
         Setting.__post_init__(self)
         self.variants  # noqa: B018  (refuses what makes no sense)
 
