@@ -18,7 +18,8 @@ import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.classifier import Classifier, train_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
@@ -217,7 +218,7 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear"}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear", "test_mirror": False}
     assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 

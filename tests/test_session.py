@@ -382,7 +382,7 @@ def test_a_classifier_of_another_model_is_refused():
 
 def test_learning_online_predicts_first():
     """Equal to the plain loop: predict with what is known, then learn."""
-    from streamfeat.classify.classifier import OnlineClassifier
+    from streamfeat.classify.online import OnlineClassifier
 
     names = ("cat", "dog", "owl")
     items = tiny.labelled_items(40, names=names)

@@ -8,8 +8,9 @@ Not here: anything another program might want to call. Commands import what they
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
+import typer
 from rich.markup import escape
 
 from streamfeat.cli import (
@@ -42,6 +43,9 @@ __all__ = [
     "viewing",
 ]
 
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""Of the library of Typer, which has it under no name of its own."""
+
 
 def main() -> NoReturn:
     """Run the command line; what the user can mend ends with one line and exit status 2.
@@ -50,7 +54,10 @@ def main() -> NoReturn:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        app()
+        status = app(prog_name="streamfeat", standalone_mode=False)
+    except _UsageError as error:
+        _tell(error)
+        sys.exit(2)
     except InputError as error:
         err.print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}", soft_wrap=True)
         sys.exit(2)
@@ -59,7 +66,19 @@ def main() -> NoReturn:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
-    sys.exit(0)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _tell(error: Any) -> None:
+    """A command line that makes no sense: one line in place of three. Without a command it is the help."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return
+    said = error.format_message().rstrip(".")
+    line = said[:1].lower() + said[1:]
+    if error.ctx:
+        line += f" (`{error.ctx.command_path} -h` says more)"
+    err.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

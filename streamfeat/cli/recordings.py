@@ -23,9 +23,9 @@ from streamfeat.cli.program import (
     err,
     print_losses,
     print_result,
-    progress_bars,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location, location_of

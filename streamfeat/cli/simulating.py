@@ -19,10 +19,10 @@ from streamfeat.cli.program import (
     app,
     completing,
     print_result,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.recordings import (
     GapOption,
     HoldOutOption,

@@ -415,7 +415,7 @@ MUTANTS = [
     Mutant(
         "another kind is read",
         "files/safetensors_file.py",
-        'header.get("format") != kind',
+        'header.get("format") not in kinds',
         'header.get("format") is None',
         "tests/test_golden.py -k kind",
     ),
