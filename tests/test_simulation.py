@@ -350,3 +350,14 @@ def test_slow_photoreceptors_see_a_step_late():
     # A step of 1 is at half of it after ln 2 / (2 pi f): 11.03 ms at 10 Hz, and rises over one frame.
     assert first(0.0) == 500
     assert first(10.0) == pytest.approx(11_030, abs=600)
+
+
+def test_a_pixel_with_more_events_than_there_is_room_for_loses_none():
+    seeing = EventCamera(CameraModel((1, 3), 2.0**-17, 0.0, refractory_us=0, noise_hz=0.0), RNG(0))
+    seeing.see(np.zeros((1, 3)), 0)
+    seeing.see(np.array([[0.0, 1.0, -0.5]]), 1_000)
+    seeing.see(np.array([[0.25, 1.0, -0.5]]), 2_000)
+    events = seeing.events(last=True)
+    by_pixel = [np.count_nonzero(events["x"] == x) for x in range(3)]
+    assert by_pixel == pytest.approx([2**15, 2**17, 2**16], abs=1)  # one may fall on the last microsecond
+    assert (np.diff(events["t"]) >= 0).all()

@@ -80,6 +80,14 @@ def latency(
         float, typer.Option(help="Pace of end to end: 1 is the recorded one, 2 twice that.")
     ] = 1.0,
     split: Annotated[str | None, typer.Option(help="Measure on samples of this split only.")] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="Updates of others beside: hats, hots, hfirst, gabor-snn or counts; may be repeated.",
+            autocompletion=completing("hats", "hots", "hfirst", "gabor-snn", "counts"),
+        ),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
     ] = None,
@@ -110,6 +118,7 @@ def latency(
         speed=speed,
         look_ahead=look_ahead,
         threads=threads,
+        methods=methods or (),
     )
     print_assumptions(report.assumptions)
     compile_first(quiet=quiet)

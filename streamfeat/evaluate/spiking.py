@@ -6,6 +6,7 @@ Not here: methods of time surfaces (`surfaces`), and the loops over events (`ker
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,8 @@ class _GridOfSpikes:
     """
 
     grid: int
-    n_orientations: int = 12
+    n_orientations: ClassVar[int] = 12
+    kernel: ClassVar[Callable[..., None]]
 
     @property
     def n_features(self) -> int:
@@ -76,6 +78,17 @@ class _GridOfSpikes:
 
     def counter(self, resolution: Resolution) -> Callable[[IntArray, IntArray, IntArray, IntArray], IntArray]:
         """A function that takes the next events (x, y, p, us) and gives the spikes so far, of each cell."""
+        clocked, state = self.state(resolution)
+
+        def count(x: IntArray, y: IntArray, p: IntArray, t: IntArray) -> IntArray:
+            self.kernel(x, y, p, clocked(t), *state)
+            counts: IntArray = state[-1]
+            return counts
+
+        return count
+
+    def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:
+        """From microseconds to the kernel's time, and all that it takes after the events; counts are last."""
         raise NotImplementedError
 
 
@@ -95,8 +108,9 @@ class FirstSpikes(_GridOfSpikes):
     """
 
     grid: int = 8
+    kernel: ClassVar[Callable[..., None]] = staticmethod(spike_first)
 
-    def counter(self, resolution: Resolution) -> Callable[[IntArray, IntArray, IntArray, IntArray], IntArray]:
+    def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:
         """See `_GridOfSpikes`."""
         weights = np.rint(gabor_filters(7, self.n_orientations)).astype(np.int32)
         limits = np.array([150, 25, 5, 5, 4], np.int64)
@@ -105,12 +119,8 @@ class FirstSpikes(_GridOfSpikes):
         potential = np.zeros((2, height, width, self.n_orientations), np.int32)
         updated, fired = np.zeros((2, height, width), np.int64), np.full((2, height, width), BEFORE_TIME)
         pooled, counts = np.full(cells, BEFORE_TIME), np.zeros(cells, np.int64)
-
-        def count(x: IntArray, y: IntArray, p: IntArray, t: IntArray) -> IntArray:
-            spike_first(x, y, p, t // 1000, weights, limits, potential, updated, fired, pooled, counts)
-            return counts
-
-        return count
+        state = weights, limits, potential, updated, fired, pooled, counts
+        return lambda t: t // 1000, state
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,18 +143,14 @@ class LeakySpikes(_GridOfSpikes):
 
     grid: int = 8
     tau_us: float = 10_000.0
+    kernel: ClassVar[Callable[..., None]] = staticmethod(spike_leaky)
 
-    def counter(self, resolution: Resolution) -> Callable[[IntArray, IntArray, IntArray, IntArray], IntArray]:
+    def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:
         """See `_GridOfSpikes`."""
         weights = gabor_filters(7, self.n_orientations)
         height, width = resolution
         neurons = 2, height, width, self.n_orientations
         potential, updated, fired = np.zeros(neurons), np.zeros(neurons[:3]), np.full(neurons, -np.inf)
         counts = np.zeros((-(-height // 4), -(-width // 4), self.n_orientations), np.int64)
-
-        def count(x: IntArray, y: IntArray, p: IntArray, t: IntArray) -> IntArray:
-            now, dead = t / self.tau_us, 5_000 / self.tau_us
-            spike_leaky(x, y, p, now, weights, 150.0, dead, 4, potential, updated, fired, counts)
-            return counts
-
-        return count
+        state = weights, 150.0, 5_000 / self.tau_us, 4, potential, updated, fired, counts
+        return lambda t: t / self.tau_us, state

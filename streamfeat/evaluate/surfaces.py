@@ -83,7 +83,7 @@ class AveragedSurfaces:
     @property
     def n_features(self) -> int:
         """Both polarities of a surface for each cell."""
-        return int(np.prod(self._shape))
+        return int(np.prod(self.shape))
 
     @property
     def fingerprint(self) -> str:
@@ -91,7 +91,8 @@ class AveragedSurfaces:
         return repr(self)
 
     @property
-    def _shape(self) -> tuple[int, int, int, int, int]:
+    def shape(self) -> tuple[int, int, int, int, int]:
+        """Rows and columns of cells, polarities, rows and columns of a surface."""
         rows, columns = (-(-side // self.cell) for side in self.resolution)
         return rows, columns, 2, 2 * self.radius + 1, 2 * self.radius + 1
 
@@ -101,9 +102,9 @@ class AveragedSurfaces:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
         inside = min(resolution[0], self.resolution[0]), min(resolution[1], self.resolution[1])
         x, y, p, t = until(events, inside, origin_us, t_us)
-        sums = np.zeros(self._shape)
+        sums = np.zeros(self.shape)
         add_memory_surfaces(x, y, p, t / self.tau_us, self.cell, np.zeros((2, *self.resolution)), sums)
-        rows, columns = self._shape[:2]
+        rows, columns = self.shape[:2]
         cells = np.bincount(y // self.cell * columns + x // self.cell, minlength=rows * columns)
         sums /= np.maximum(cells, 1).reshape(rows, columns, 1, 1, 1)
         return sums.ravel().astype(np.float32)
