@@ -336,10 +336,6 @@ def bad(home, tmp_path_factory):
     changed_model(home / "direct", bad / "new_model", version=2)
     changed_model(home / "direct", bad / "odd_model", arrays={"mean": np.zeros(7, np.float32)})
     (bad / "cut_model").write_bytes((home / "direct").read_bytes()[:-10])
-    tiny.write_items(
-        bad / "small.mcap",
-        [Label(0, 1000, "cat"), tiny.packet(tiny.steady(0, 1000, 50, resolution=(5, 5)), (5, 5))],
-    )
     tiny.write_items(bad / "unlabelled.mcap", [tiny.packet(tiny.steady(0, 90_000, 900))])
     tiny.write_items(bad / "partly_labelled.mcap", tiny.labelled_items(6, names=("cat", "", "dog")))
     tiny.write_items(bad / "one_class.mcap", tiny.labelled_items(4, names=("cat",)))
@@ -396,8 +392,6 @@ REFUSALS = {
     "existing recording": (["convert", "{bad}/data", "{bad}/existing"], "exists already"),
     "output in no folder": ([*REPLAY, "-o", "{bad}/no/out.mcap"], "there is no folder"),
     "output is a folder": ([*REPLAY, "-o", "{bad}/folder", "--overwrite"], "is a folder"),
-    "sensor too small": (["replay", "{bad}/small.mcap", "-m", "{home}/direct"], "5x5 pixels"),
-    "sensor too small to train": (["train", "{bad}/small.mcap", *TRAIN], "5x5 pixels"),
     "emit": ([*REPLAY, "--emit", "often"], "--emit 'often'"),
     "speed": ([*REPLAY, "--speed", "-1"], "--speed '-1'"),
     "split": ([*REPLAY, "--split", "moon"], "no samples of split 'moon'"),

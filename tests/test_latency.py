@@ -342,8 +342,6 @@ def home(tmp_path_factory):
     for formulation in ("direct", "inverse"):
         tiny.encoder(formulation, "soft", k=3).save(home / f"{formulation}.safetensors")
     tiny.write_digits(home / "digits.mcap", 8, n_held_out=2)
-    small = [tiny.packet(tiny.steady(0, 90_000, 3000, resolution=(3, 3)), (3, 3))]
-    tiny.write_items(home / "small.mcap", small)
     tiny.write_items(home / "short.mcap", [tiny.packet(tiny.steady(0, 90_000, 300))])
     write_empty(home / "empty.mcap")
     (home / "mine.html").write_text("mine")
@@ -427,7 +425,6 @@ def test_one_split_without_look_ahead(run, home):
 REFUSALS = {
     "shorter than its warm-up": (["short.mcap"], "300 events are not more than the warm-up of 500"),
     "without events": (["empty.mcap"], "has no events"),
-    "model for another resolution": (["small.mcap"], "too small for one volume"),
     "unknown policy": (["digits.mcap", "--emit", "often"], "--emit 'often' is not understood"),
     "unknown suffix": (
         ["digits.mcap", "--plot", "{home}/out.pdf"],

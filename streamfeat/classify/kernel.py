@@ -183,7 +183,7 @@ def train_kernel_classifier(
             probabilities.
 
     Raises:
-        InputError: there are more rows than the kernel matrix may have.
+        InputError: there are more rows than the kernel matrix may have, or memory for.
     """
     n = len(features)
     if n > MOST_POINTS:
@@ -192,6 +192,22 @@ def train_kernel_classifier(
             f"{8 * n * n / 2**30:.1f} GiB, at most {MOST_POINTS:,} rows are taken; give --kernel linear, or "
             "fewer samples or variants of them"
         )
+    try:
+        return _trained(features, linear, labels, parts)
+    except MemoryError:
+        raise InputError(
+            f"not enough memory for --kernel rbf with {n:,} training rows, which takes at least "
+            f"{8 * n * n / 2**30:.1f} GiB; give --kernel linear, or fewer samples or variants of them"
+        ) from None
+
+
+def _trained(
+    features: NDArray[np.float32],
+    linear: Classifier,
+    labels: NDArray[np.str_],
+    parts: NDArray[np.int64] | None,
+) -> KernelClassifier:
+    n = len(features)
     rows = normalise_features(features)
     mean = rows.mean(axis=0, dtype=np.float64).astype(np.float32)
     rows -= mean

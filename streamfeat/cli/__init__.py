@@ -9,13 +9,12 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from io import TextIOWrapper
 from types import FrameType
 from typing import Any, NoReturn
 
+import typer
 from rich.markup import escape
 
 from streamfeat.cli import (
@@ -25,6 +24,7 @@ from streamfeat.cli import (
     live,
     measuring,
     recordings,
+    simulating,
     starting,
     streaming,
     viewing,
@@ -41,10 +41,14 @@ __all__ = [
     "main",
     "measuring",
     "recordings",
+    "simulating",
     "starting",
     "streaming",
     "viewing",
 ]
+
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""Of the library of Typer, which has it under no name of its own."""
 
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG}
@@ -54,56 +58,44 @@ def main() -> NoReturn:
     """Run the command line; what the user can mend ends with one line and exit status 2.
 
     SIGTERM ends a command as Ctrl-C does: with what is done written, and nothing half written. Where nobody
-    reads standard output any more, as behind `| head`, the command ends silently with 1.
+    reads standard output any more, as behind `| head`, a command ends silently with 1.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # where the encoding lacks a letter, its number is shown
             stream.reconfigure(errors="backslashreplace")
     try:
-        app()
-    except SystemExit as end:
-        sys.exit(_status(partial(_flushed, end.code)))
-    except BaseException as error:
-        sys.exit(_status(partial(_failed, error)))
-    sys.exit(_status(partial(_flushed, 0)))
-
-
-def _status(ending: Callable[[], Any]) -> Any:
-    """The exit status of a command, whose last words may meet a pipe without a reader or a full disk."""
-    try:
-        return ending()
+        status = _run()
+        if sys.stdout:
+            sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()
-        return 1
+        status = 1
     except OSError as error:
         if error.errno not in _NO_ROOM or error.filename is not None:
             raise
         _drop_output()
-        with suppress(OSError):
-            err.print(f"[bold red]error:[/] standard output cannot be written: {error.strerror}")
+        err.print(f"[bold red]error:[/] standard output cannot be written: {error.strerror}")
+        status = 2
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run a command; its exit status."""
+    try:
+        status = app(prog_name="streamfeat", standalone_mode=False)
+    except _UsageError as error:
+        _tell(error)
         return 2
-
-
-def _flushed(status: Any) -> Any:
-    if sys.stdout:
-        sys.stdout.flush()
-    return status
-
-
-def _failed(error: BaseException) -> int:
-    """Say what went wrong, if it is no bug."""
-    match error:
-        case InputError():
-            told, status = " ".join(str(error).split()), 2
-        case MemoryError():
-            told, status = f"out of memory, ask for less: {error}", 2
-        case KeyboardInterrupt():
-            return 130
-        case _:
-            raise error
-    err.print(f"[bold red]error:[/] {escape(told)}", soft_wrap=True)
-    return status
+    except InputError as error:
+        err.print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}", soft_wrap=True)
+        return 2
+    except MemoryError as error:
+        err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return status if isinstance(status, int) else 0
 
 
 def _drop_output() -> None:
@@ -112,6 +104,18 @@ def _drop_output() -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
+
+
+def _tell(error: Any) -> None:
+    """A command line that makes no sense: one line in place of three. Without a command it is the help."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return
+    said = error.format_message().rstrip(".")
+    line = said[:1].lower() + said[1:]
+    if error.ctx:
+        line += f" (`{error.ctx.command_path} -h` says more)"
+    err.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -25,15 +25,16 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    compile_first,
     completing,
     err,
     model_or_general,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
 
@@ -251,6 +252,7 @@ def train(
                     f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
                     "or write them with `streamfeat convert`"
                 )
+        compile_first(quiet=quiet)
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)

@@ -129,6 +129,15 @@ RESULTS: dict[str, dict[str, Field]] = {
         "faults": Field("[object]", "`file`, `what` and `reason` of each"),
         "removed": _REMOVED,
     },
+    "simulate": {
+        "written": _WRITTEN,
+        "samples": Field("int", "images that were simulated; 1 for a film"),
+        "events": Field("int", "events in the file"),
+        "bytes_out": Field("int", "of the file"),
+        "failed": Field("int", "images that could not be read, or give no events", quiet=True),
+        "damaged": Field("int", "frames or parts of a film that could not be read", quiet=True),
+        "faults": Field("[object]", "`file`, `what` and `reason` of each"),
+    },
     "label": {
         "labels": Field("text?", "the label file; null if nothing was labelled", "label file"),
         "samples": Field("int", "labels in it", "labels"),

@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     model_or_general,
     print_result,
     refuse_existing,
+    tell_compiling,
 )
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
@@ -143,6 +144,8 @@ def view(
     )
     if recording:
         print_assumptions(job.assumptions)
+    if model or features or classifier:
+        tell_compiling(quiet=quiet)
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     job.run()

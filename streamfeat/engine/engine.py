@@ -78,7 +78,7 @@ class Engine(Shown):
         threads: that share the work of a large emission; features have the same bits for any number.
 
     Raises:
-        InputError: the sensor has no place for a single volume, or so many that sums could overflow; the
+        InputError: the sensor has so many volumes that sums could overflow; the
             origin is beyond 2^62 microseconds; or threads are not 1 to 256.
     """
 

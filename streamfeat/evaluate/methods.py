@@ -1,7 +1,7 @@
 """From a method's name and a setting to a map from events to features.
 
 Lives here: learning with either formulation, and the filters that those are compared with.
-Not here: methods without filters (`surfaces`), and what features are good for (`cell`).
+Not here: methods that learn no filters (`surfaces`, `spiking`), and what features are good for (`cell`).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,6 +12,7 @@ import numpy as np
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.engine.geometry import Geometry
 from streamfeat.evaluate.plan import Trial
+from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.learn.fit import geometries_of, learn_encoder, prepare
 from streamfeat.learn.initial import random_filters, spherical_means
@@ -58,6 +59,10 @@ def make_features(
         return Encoder.load(model_path(setting))
     if method == "counts":
         return CountImage()
+    if method == "hfirst":
+        return FirstSpikes()
+    if method == "gabor-snn":
+        return LeakySpikes()
     if method == "hats":
         return AveragedSurfaces.fitted(recordings)
     if method == "hots":

@@ -10,6 +10,7 @@ from streamfeat.evaluate.plan import METHODS
 
 __all__ = [
     "COLUMNS",
+    "against_table",
     "all_numbers",
     "base_rows",
     "cells",
@@ -141,6 +142,20 @@ def _name(row: dict[str, Any]) -> str:
     return f"{row['method']}, {row['swept'].replace('_', ' ')} {value_text(row['setting'][row['swept']])}"
 
 
+def against_table(result: dict[str, Any]) -> Lines:
+    """The difference of each row to the first row of an earlier result; no rows without one."""
+    return ("what", "accuracy", "difference", "95 % interval"), [
+        [
+            _name(row),
+            f"{row['accuracy']:.4f}",
+            f"{row['against']['accuracy']:+.4f}",
+            f"{row['against']['low']:+.4f} to {row['against']['high']:+.4f}",
+        ]
+        for row in result["rows"]
+        if "against" in row
+    ]
+
+
 def online_table(result: dict[str, Any]) -> Lines:
     """Prequential accuracy of each method."""
     rows = [row for row in base_rows(result) if "prequential" in row]
@@ -186,6 +201,10 @@ def notes(result: dict[str, Any]) -> list[str]:
         "kernel rbf, Gaussian kernel ridge. Encoding is of all "
         "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
+    if errors := [
+        f"{_name(row)} {row['calibration_error']:.3f}" for row in result["rows"] if "calibration_error" in row
+    ]:
+        lines.append(f"Error of calibration of the probabilities, expected, ten bins: {', '.join(errors)}.")
     if leakage := result["leakage"]:
         lines.append(_leakage_note(leakage))
     if len(base_rows(result)) > 1:

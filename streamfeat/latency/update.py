@@ -81,7 +81,7 @@ def walk(
         goes: asked from time to time.
 
     Raises:
-        InputError: a sensor has no place for a volume.
+        InputError: a sensor has so many volumes that sums could overflow.
     """
     return _each_event(follow_timed, encoder, items, look_ahead, warm_up, goes)
 
