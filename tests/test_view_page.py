@@ -300,6 +300,30 @@ def test_a_page_without_anything_to_show_says_so(tab):
 
 @pytest.mark.real_time
 @needs_chromium
+def test_a_thousand_classes_and_names_of_any_kind_are_drawn(tab):
+    """A newline in a class was the end of the page; so were a thousand classes."""
+    names = ["two\nlines", "<b>bold</b>", "\u202eright to left", *(f"class {i}" for i in range(997))]
+    server = PageServer(page, 0)
+    try:
+        tab.open(server.address)
+        server.record("", "about", 0, about(MODEL, names))
+        tab.until("model.about?.labels.length == 1000")
+        for i in range(200):
+            scores = [float((7 * i + j) % 1000 == 0) + (j == 0) for j in range(1000)]
+            record = {"t_s": i, "label": names[0], "scores": scores, "sample": None}
+            server.record("/view", "prediction", i, record)
+            tab.until(f"model.scores.at(-1)?.t == {i}")
+        tab.settle()
+        legend = tab.value("document.getElementById('legend').innerText")
+        assert {"two", "lines", "others"} <= set(legend.split())
+        assert tab.value("document.querySelectorAll('#legend b').length") <= 11
+        assert tab.problems == []
+    finally:
+        server.close()
+
+
+@pytest.mark.real_time
+@needs_chromium
 def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
     server = PageServer(page, 0)
     status = {"t_s": 0, "width": 16, "height": 12, "events": 5, "events_per_s": 0, "drops": {"late": 2}}

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from streamfeat.cli.consoles import err, out
 from streamfeat.cli.results import RESULTS, complete, for_people
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import is_replaced, refuse_input
@@ -70,7 +70,6 @@ _ORDER = (
     "latency",
     "view",
 )
-_PIPE_COLUMNS = 1_000
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
@@ -99,20 +98,6 @@ app = typer.Typer(
 )
 
 
-class _WholeConsole(Console):
-    """A console that cuts nothing where it is no terminal: what reads a pipe or a file has room."""
-
-    @property  # type: ignore[misc]
-    def size(self) -> ConsoleDimensions:
-        size = super().size
-        cuts = self.is_terminal or "COLUMNS" in os.environ
-        return size if cuts else ConsoleDimensions(_PIPE_COLUMNS, size.height)
-
-
-out = _WholeConsole(highlight=False, emoji=False)
-err = _WholeConsole(stderr=True, highlight=False, emoji=False)
-
-
 @app.callback()
 def _options(
     version: Annotated[
@@ -121,8 +106,18 @@ def _options(
             "--version", is_eager=True, callback=lambda asked: _tell_version(asked), help="Print the version."
         ),
     ] = False,
+    unpack: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BYTES",
+            help="Let a file unpack to so much, such as 4G, where that is over 64M and 200 times the file.",
+        ),
+    ] = None,
 ) -> None:
-    pass
+    if unpack is not None:
+        from streamfeat.files.budget import VARIABLE, parse_bytes
+
+        os.environ[VARIABLE] = str(parse_bytes(unpack))  # which processes that this one starts have, too
 
 
 def _tell_version(asked: bool) -> None:

@@ -4,6 +4,7 @@ Lives here: the sink that a view adds to a pipeline, and what its messages say.
 Not here: channels (`channels`), pictures (`pictures`), taking sights (`observe`).
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -205,7 +206,7 @@ def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
         "downsample": str(geometry.downsample),
         "pooling": str(geometry.pooling),
         "scales": str(len(encoder.scales)),
-        "labels": "\n".join(labels),
+        "labels": json.dumps(list(labels)),
     }
 
 

@@ -2,6 +2,7 @@
 
 const KEPT = 200;
 const QUIET_MS = 2000;
+const MOST_LINES = 40;
 const CLASS_COLOURS = [
   "#2f7ed8", "#e8731a", "#2ca25f", "#d6336c", "#8f63d2", "#a06a42", "#e05fb6", "#8a8f98", "#a7a51c", "#17a2b8",
 ];
@@ -58,9 +59,9 @@ const listener = {
     dirty = true;
     if (channel === "about") {
       const { labels, ...about } = message;
-      model.about = { ...about, labels: labels ? labels.split("\n") : [] };
+      model.about = { ...about, labels: labels ? JSON.parse(labels) : [] };
       document.body.classList.toggle("plain", !about.formulation);
-      document.body.classList.toggle("unjudged", !labels);
+      document.body.classList.toggle("unjudged", !model.about.labels.length);
       return;
     }
     if (!model.cameras.has(camera)) {
@@ -203,7 +204,8 @@ function drawScores(prediction, startS) {
   const shown = leaders(labels);
   const of = new Map(shown.map((i, place) => [labels[i], CLASS_COLOURS[place]]));
   const others = labels.map((_, i) => i).filter((i) => !shown.includes(i));
-  const order = [...others, ...shown];
+  // Lines of hundreds of classes would take longer to draw than until the next picture, and tell nothing.
+  const order = others.length <= MOST_LINES ? [...others, ...shown] : shown;
   const strips = [{ name: "predicted", colours: model.scores.map(({ label }) => of.get(label) ?? null) }];
   if (model.scores.some(({ truth }) => truth !== undefined)) {
     strips.unshift({ name: "label", colours: model.scores.map(({ truth }) => of.get(truth) ?? null) });
