@@ -10,9 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from streamfeat.classify.calibration import calibration_error, fitted_temperature, probabilities
-from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.calibration import (
+    calibration_error,
+    checked_by_folds,
+    fitted_temperature,
+    probabilities,
+)
+from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.kernel import load_classifier, train_kernel_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
 
@@ -35,6 +41,23 @@ def test_the_temperature_that_labels_were_drawn_with_is_found(temperature):
     assert found == pytest.approx(temperature, rel=0.08)
     assert calibration_error(probabilities(scores, found), targets) < 0.02
     assert calibration_error(probabilities(scores, 10 * temperature), targets) > 0.1
+
+
+def test_a_temperature_that_folds_do_not_agree_on_is_not_used():
+    # One fold is hard, as a block of other scenes is: by itself it asks for much more than the others do.
+    folds = [drawn(3000, t, labels=2, seed=seed) for seed, t in enumerate((0.7, 0.6, 6.0))]
+    scores, targets = (np.concatenate(column) for column in zip(*folds, strict=True))
+    parts = np.repeat([0, 1, 2], 3000)
+    assert fitted_temperature(scores, targets) > 1.3
+    assert checked_by_folds(scores, targets, parts) == 1.0
+
+
+def test_a_temperature_that_folds_agree_on_is_used():
+    folds = [drawn(3000, t, seed=seed) for seed, t in enumerate((3.0, 3.5, 4.0))]
+    scores, targets = (np.concatenate(column) for column in zip(*folds, strict=True))
+    found = checked_by_folds(scores, targets, np.repeat([0, 1, 2], 3000))
+    assert found == fitted_temperature(scores, targets)
+    assert 3.0 < found < 4.0
 
 
 def test_few_samples_without_an_error_make_nothing_certain():

@@ -5,12 +5,9 @@ Not here: each step itself (`simulate`, `learn`, `classifier`, `session`), and t
 """
 
 import shlex
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import get_context
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +18,15 @@ from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import encode_samples
 from streamfeat.demo.terminal import EventPicture, TerminalView, draw_while
 from streamfeat.engine.encoder import Encoder
-from streamfeat.engine.geometry import Geometry
-from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import make_events
 from streamfeat.learn.fit import learn_encoder
 from streamfeat.learn.settings import Setting
 from streamfeat.messages.packets import Packet
 from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.simulate.saccades import CameraModel, digit_samples
+from streamfeat.simulate.camera import CameraModel
+from streamfeat.simulate.saccades import digit_samples
+from streamfeat.stream.compiling import Compilers
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
@@ -67,22 +64,14 @@ class Demo:
         """Write nothing before `simulate`."""
         self.train, self.test, self.model, self.classifier = (folder / name for name in FILES)
         self._report = report
-        self._compiler: BaseProcess | None = None
+        self._compilers: Compilers | None = None
         self.interrupted = False
 
     @contextmanager
     def compiling(self) -> Iterator[None]:
-        """Compile on another core while the block runs, into numba's cache, where `compile` finds it."""
-        self._compiler = get_context("spawn").Process(target=_compile_kernels, daemon=True)
-        # Ctrl-C is for this process, which ends the other; that one is born deaf to it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._compiler.start()
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        try:
+        """Compile on other cores while the block runs, into numba's cache, where `compile` finds it."""
+        with Compilers() as self._compilers:
             yield
-        finally:
-            self._compiler.terminate()
-            self._compiler.join()
 
     def simulate(self) -> int:
         """Write both recordings, and return how many events they have."""
@@ -123,14 +112,15 @@ class Demo:
         """
         remark = "kernels, kept for the next time"
         self._report("compiling", 0, 2, remark)
-        if self._compiler:
-            if console and TerminalView.fits(console):
+        if self._compilers:
+            if console and TerminalView.fits(console) and self._compilers.is_alive():
                 with open_recording(self.test) as recording:
                     items = recording.played(loop=True)
-                    draw_while(self._compiler.is_alive, console, items, recording.resolution)
-            self._compiler.join()
+                    draw_while(self._compilers.is_alive, console, items, recording.resolution)
+            self._compilers.wait()
         self._report("compiling", 1, 2, remark)
-        _use_kernels(encoder)
+        encoder.encode(make_events([0], [0], [1], [0]), CameraModel().resolution)
+        warm_up(encoder, _POLICY)
         self._report("compiling", 2, 2, remark)
 
     def fit(self, encoder: Encoder) -> Classifier:
@@ -188,17 +178,6 @@ class Demo:
             f"--max-count {_SETTING.max_count} --filters {_SETTING.filters} --volumes {_SETTING.volumes} "
             f"--iterations {_SETTING.iterations}",
         ]
-
-
-def _use_kernels(encoder: Encoder) -> None:
-    encoder.encode(make_events([0], [0], [1], [0]), CameraModel().resolution)
-    warm_up(encoder, _POLICY)
-
-
-def _compile_kernels() -> None:
-    """Compile by an encoder that has learned nothing: kernels are compiled for types, not for values."""
-    geometry = Geometry(patch=_SETTING.patch, n_bins=1, bin_us=1_000)
-    _use_kernels(random_encoder(0, geometry, 2, encoding="split"))
 
 
 class _Watched:

@@ -45,9 +45,6 @@ def allocate_state(
         planes: 1, or 2 to look ahead.
         threads: that share the work of large emissions.
         keep: keep a projection for each volume; without, the state serves whole windows only.
-
-    Raises:
-        InputError: the sensor has no place for a volume.
     """
     rows, columns = geometry.grid_shape(resolution)
     ring = (geometry.n_bins, *geometry.ring_shape(resolution))
@@ -57,7 +54,7 @@ def allocate_state(
     clock = np.zeros(7, np.int64)
     clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
     clock[CLOCK_ORIGIN] = origin_us
-    narrow = operator.scales is not None
+    narrow = operator.steps is not None
     numbers, queue = (np.int16, QUEUE) if narrow else (np.int32, 0)
     features = 2 * padded if narrow or operator.kind == SPLIT else padded
     return State(

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.classify.folds import assign_folds, bootstrap_units, groups_named
 from streamfeat.errors import InputError
@@ -191,11 +192,22 @@ class DataSet:
             known["reading"] = [repr(replace(self._reading, labels=None)), labels]
         return known
 
+    def held_out(self, fold: int) -> NDArray[np.bool_] | None:
+        """Which samples one fold holds out, in stored order; None where it is the recordings that say so."""
+        if not self._folds:
+            return None
+        places = zip(self.labels, self._folds[fold], strict=True)
+        return np.array([label in held_out for labels, held_out in places for label in labels], bool)
+
     @contextlib.contextmanager
-    def open(self, fold: int) -> Iterator[list[Recording]]:
-        """The recordings with the splits of one fold, closed afterwards."""
+    def open(self, fold: int | None) -> Iterator[list[Recording]]:
+        """The recordings with the splits of one fold, closed afterwards; with None, no fold holds out any."""
         with contextlib.ExitStack() as files:
-            if not self._folds:
+            if self._folds and fold is None:
+                yield [
+                    files.enter_context(Fold(path, self._topic, reading=self._reading)) for path in self.paths
+                ]
+            elif not self._folds:
                 yield [
                     files.enter_context(open_recording(path, self._topic, self._reading))
                     for path in self.paths
@@ -203,7 +215,7 @@ class DataSet:
             else:
                 yield [
                     files.enter_context(Fold(path, self._topic, held_out, reading=self._reading))
-                    for path, held_out in zip(self.paths, self._folds[fold], strict=True)
+                    for path, held_out in zip(self.paths, self._folds[fold or 0], strict=True)
                 ]
 
 

@@ -154,12 +154,12 @@ def read_features(operator: Operator, state: State, features: NDArray[np.float32
         features: `(cells * K,)`, or `(cells * 2 K,)` for SPLIT, in each cell positive parts before negative
             ones; overwritten.
     """
-    write_features(operator.scales, operator.wide, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
+    write_features(operator.steps, operator.wide, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
 
 
 @inlined
 def write_features(
-    scales: NDArray[np.float64] | None,
+    steps: NDArray[np.float64] | None,
     wide: bool | None,
     operator: Operator,
     pooled: NDArray[np.int32],
@@ -168,7 +168,7 @@ def write_features(
     """Write pooled sums of the cells as floats.
 
     Args:
-        scales: of the operator.
+        steps: of the operator.
         wide: of the operator (see `write_code`).
         operator: number of filters, encoding and fixed point.
         pooled: `(cells, F)`.
@@ -179,12 +179,12 @@ def write_features(
     for q in range(pooled.shape[0]):
         one, other = pooled[q, :width], pooled[q, width:]
         first = features[2 * q * n :] if split else features[q * n :]
-        if scales is not None:
+        if steps is not None:
             for k in range(n):
-                first[k] = np.float32((one[k] if split else one[k] - other[k]) * scales[k])
+                first[k] = np.float32((one[k] if split else one[k] - other[k]) * steps[k])
             if split:
                 for k in range(n):
-                    first[n + k] = np.float32(other[k] * scales[k])
+                    first[n + k] = np.float32(other[k] * steps[k])
         if wide is not None:
             if split:
                 for k in range(n):

@@ -71,10 +71,10 @@ class Operator(NamedTuple):
     shape: tuple[int, int] = (0, 0)
     """Rows and columns of the grid of volumes; of the sensor, not of the model, which has none."""
     wide: bool | None = True
-    """None in the narrow state, as `scales`, `upper` and `lower` are in the wide one: a kernel is compiled
+    """None in the narrow state, as `steps`, `upper` and `lower` are in the wide one: a kernel is compiled
     for the state that it is called with, and for no other."""
-    scales: NDArray[np.float64] | None = None
-    """`(Kp,)`: `P[k] = scales[k] * columns[:, k]` in the narrow state, where `scale` means nothing; of a
+    steps: NDArray[np.float64] | None = None
+    """`(Kp,)`: `P[k] = steps[k] * columns[:, k]` in the narrow state, where `scale` means nothing; of a
     sensor, what a code of one is worth."""
     upper: NDArray[np.uint16] | None = None
     """`(Kp,)`: positive codes are what is above it, 2^15 standing for zero; narrow state, of a sensor."""

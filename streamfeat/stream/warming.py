@@ -7,6 +7,7 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.events import make_events
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
 from streamfeat.messages.packets import Packet
+from streamfeat.stream.compiling import compile_together
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.session import Session
 
@@ -21,6 +22,7 @@ def warm_up(encoder: Encoder, policy: EmitPolicy, *, decoders: bool = False) -> 
         policy: that of the sessions to come.
         decoders: compile those of live payloads, too.
     """
+    compile_together()
     event = make_events([0], [0], [1], [0])
     if decoders:
         for encoding in PAYLOAD_ENCODINGS:

@@ -24,6 +24,7 @@ sys.path.append(str(ROOT))
 import streamfeat as sf  # noqa: E402
 from streamfeat.events import Resolution  # noqa: E402
 from tools.bench import machine, material, tables  # noqa: E402
+from tools.bench.cameras import measure_cameras  # noqa: E402
 from tools.bench.cluster import measure_cluster  # noqa: E402
 from tools.bench.direct import measure_floors, measure_peers  # noqa: E402
 from tools.bench.fleet_plan import plan  # noqa: E402
@@ -45,6 +46,10 @@ from tools.bench.timing import stolen_seconds  # noqa: E402
 PARTS: dict[str, tuple[Callable[..., dict[str, Any]], str]] = {
     "floors": (measure_floors, "our update against the same in C, and against its bytes"),
     "peers": (measure_peers, "against matrix products, FEAST and HATS"),
+    "cameras": (
+        measure_cameras,
+        "emissions of 346x260 and 640x480, against conv2d of PyTorch and FEAST",
+    ),
     "ingest": (measure_ingest, "counting events, against voxel grids"),
     "inverse": (measure_inverse, "the lasso, against scikit-learn and SPAMS"),
     "latency": (measure_latency, "percentiles of single events"),
@@ -96,6 +101,12 @@ def _parser() -> argparse.ArgumentParser:
         default=dense if dense.exists() else None,
         help="a second recording for the part replay, of many events a second (default: %(default)s)",
     )
+    add(
+        "--samples",
+        type=Path,
+        default=samples if samples.exists() else None,
+        help="folder of camera samples for the part cameras (default: %(default)s)",
+    )
     add("--only", metavar="PARTS", help="comma-separated parts to measure")
     add("--quick", action="store_true", help="smallest sizes; figures mean nothing")
     add("--filters", type=int, help="K (default: 1700, or 64 with --quick)")
@@ -146,7 +157,7 @@ def _measure(options: argparse.Namespace) -> int:
     for number, name in enumerate(wanted):
         start, stolen = time.perf_counter(), stolen_seconds()
         print(f"[{number + 1}/{len(wanted)}] {name}", file=sys.stderr)
-        more = (options.dense,) if name == "replay" else ()
+        more = {"replay": (options.dense,), "cameras": (options.samples,)}.get(name, ())
         results["parts"][name] = PARTS[name][0](setting, *more)
         seconds = time.perf_counter() - start
         share = (stolen_seconds() - stolen) / seconds

@@ -14,7 +14,7 @@ from typing import Any
 
 __all__ = ["PEERS", "compiler_version", "describe", "version"]
 
-PEERS = ("eventcv", "tonic", "river", "pandas", "spams-bin", "matplotlib")
+PEERS = ("eventcv", "tonic", "river", "pandas", "spams-bin", "matplotlib", "torch")
 """Packages of the extra `bench` that parts can do without, one by one."""
 
 _PACKAGES = ("streamfeat", "numpy", "numba", "scipy", "scikit-learn", "mcap", "lz4", *PEERS)

@@ -1,4 +1,4 @@
-"""The pictures of the parts `growth` and `scaling`.
+"""The pictures of the parts `growth` and `scaling`, and of `profile`.
 
 Lives here: drawing. Not here: the figures (`growth`, `scaling`), their tables (`tables`).
 """
@@ -6,7 +6,7 @@ Lives here: drawing. Not here: the figures (`growth`, `scaling`), their tables (
 from pathlib import Path
 from typing import Any
 
-__all__ = ["draw_growth", "draw_scaling"]
+__all__ = ["draw_curves", "draw_growth", "draw_scaling"]
 
 _SWEEPS = {
     "filters": "filters K",
@@ -97,4 +97,22 @@ def draw_scaling(figures: dict[str, Any], target: Path) -> None:
         axes.grid(alpha=0.3)
     panels[0].set_xscale("log")
     panels[0].legend(fontsize=7)
+    figure.savefig(target, format="svg", metadata={"Date": None})
+
+
+def draw_curves(found: dict[str, list[tuple[float, float, float]]], target: Path) -> None:
+    """Milliseconds of an emission before and now as SVG, a panel for each quantity."""
+    figure, panels = _figure(12, len(found), sharey=True)
+    for axes, (quantity, points) in zip(panels, found.items(), strict=True):
+        values, *both = zip(*points, strict=True)
+        for name, colour, measured in zip(("before", "now"), ("tab:grey", "tab:orange"), both, strict=True):
+            axes.plot(values, measured, "o-", markersize=4, linewidth=1, color=colour, label=name)
+        axes.set_xscale("log")
+        axes.set_xticks(values, [f"{value:,g}" for value in values], fontsize=6)
+        axes.set_xticks([], minor=True)
+        axes.set_yscale("log")
+        axes.set_xlabel(quantity)
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("ms an emission")
+    panels[0].legend(fontsize=6)
     figure.savefig(target, format="svg", metadata={"Date": None})

@@ -78,8 +78,8 @@ def memory_of_engine(n_filters: int, *, look_ahead: bool) -> dict[str, Any]:
     """Bytes of one engine that has seen events all over its sensor.
 
     The arithmetic minimum: an int32 count for each pixel of the ring and each bin, one int32 row of K
-    projections for each volume, and four int32 rows of pooled sums. The operator is read-only and shared by
-    all engines of an encoder.
+    projections for each volume, looking ahead two, and four int32 rows of pooled sums. The operator is
+    read-only and shared by all engines of an encoder.
     """
     geometry = sf.Geometry(patch=12, stride=4, n_bins=7, bin_us=1000, downsample=4)
     rng = np.random.default_rng(0)
@@ -93,7 +93,8 @@ def memory_of_engine(n_filters: int, *, look_ahead: bool) -> dict[str, Any]:
     resident = _resident() - before
     allocated = _allocations(engine, rng)
     (rows, columns), (height, width) = geometry.grid_shape(resolution), geometry.ring_shape(resolution)
-    least = 4 * (geometry.n_bins * height * width + rows * columns * n_filters + 4 * n_filters)
+    projected = (2 if look_ahead else 1) * rows * columns * n_filters
+    least = 4 * (geometry.n_bins * height * width + projected + 4 * n_filters)
     own = _own_bytes(engine, set())
     return {
         "volumes": rows * columns,
@@ -150,7 +151,9 @@ def _own_bytes(value: Any, seen: set[int]) -> int:
         return 0
     seen.add(id(value))
     if isinstance(value, np.ndarray):
-        return value.nbytes if value.flags.writeable and value.base is None else 0
+        if isinstance(value.base, np.ndarray):  # aligned within a larger one, which nothing else holds
+            return _own_bytes(value.base, seen)
+        return value.nbytes if value.flags.writeable else 0
     if isinstance(value, tuple | list):
         return sum(_own_bytes(item, seen) for item in value)
     return sum(_own_bytes(item, seen) for item in vars(value).values()) if hasattr(value, "__dict__") else 0

@@ -1,9 +1,10 @@
-"""A whole replay against bare reading of the same file.
+"""A whole replay against the camera's own pace, and beside it bare reading of the same file.
 
 Lives here: the part `replay`. Not here: what a single event costs.
 
 The file is written again with lz4. Bare reading comes in two kinds: messages handed out by the mcap library
-and left undecoded, the stricter and the one that the target means; and our own decoding into events.
+and left undecoded; and our own decoding into events. Emissions come every 10 ms of stream time while there
+is any, so their number says how long the camera took.
 """
 
 import tempfile
@@ -15,9 +16,11 @@ from mcap.reader import NonSeekingReader
 import streamfeat as sf
 from streamfeat.stream.replay import ReplayJob
 from tools.bench.material import Setting, encoder_of
-from tools.bench.timing import WALL, Contestant, race
+from tools.bench.timing import WALL, Contestant, race, summary
 
 __all__ = ["measure_replay"]
+
+EMIT_S = 0.01
 
 
 def measure_replay(setting: Setting, dense: Path | None) -> dict[str, Any]:
@@ -82,9 +85,12 @@ def _measure(setting: Setting, path: Path, model: Path, events: int) -> dict[str
         "messages, decoded": Contestant(read_events, events, clock=WALL),
     }
     result = race(contestants, setting.rounds(5))
+    stream_s = emissions * EMIT_S
+    paces = stream_s / (result.nanoseconds["replay"] * events / 1e9)
     return {
         "events": events,
         "emissions": emissions,
+        "pace": summary(paces),
         "race": result.figures(),
         "events_per_s": {name: round(1e9 / result.figure(name)["p50"]) for name in contestants},
         "speed_of_reading": {name: result.ratio(name, "replay") for name in contestants if name != "replay"},

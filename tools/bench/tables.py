@@ -50,7 +50,7 @@ def markdown(results: dict[str, Any]) -> str:
 def verdict_lines(results: dict[str, Any]) -> list[str]:
     """One line a target, for the terminal."""
     return [
-        f"{_verdict(v):>9}  {v.target.figure.replace('`', '')}: {_value(v)}, target {v.target.text}"
+        f"{_verdict(v):>9}  {v.target.figure.replace('`', '')}: {_value(v)}, floor {v.target.text}"
         for v in judge(results)
     ]
 
@@ -69,8 +69,8 @@ def _machine(results: dict[str, Any]) -> str:
 
 
 def _targets(results: dict[str, Any]) -> str:
-    rows = [(v.target.figure, v.target.text, _value(v), _verdict(v)) for v in judge(results)]
-    return _table(("figure", "target", "measured", ""), rows)
+    rows = [(v.target.figure, v.target.text, _value(v), _verdict(v), v.target.why) for v in judge(results)]
+    return _table(("figure", "floor", "measured", "", "why this much"), rows)
 
 
 def _verdict(verdict: Verdict) -> str:
@@ -123,6 +123,30 @@ def _peers(part: dict[str, Any]) -> str:
         "**Direct formulation**: one event and volume.\n\n"
         + _table(("", "time", "slower than `soft`"), rows)
         + _missing(part)
+    )
+
+
+def _cameras(part: dict[str, Any]) -> str:
+    if set(part) == {"missing"}:
+        return ""
+    rows = [
+        (
+            f"{found['resolution'][1]}x{found['resolution'][0]}",
+            name.replace("ours", "streamfeat"),
+            _time(figure),
+            _over(found["over_ours"][name]) + " x" if name in found["over_ours"] else "",
+        )
+        for found in part.values()
+        for name, figure in found["race"]["ns"].items()
+    ]
+    events = ", ".join(f"{found['events_per_emission']:,}" for found in part.values())
+    differences = [found["largest_difference"] for found in part.values() if found["largest_difference"]]
+    agreement = f" Its features are ours to {max(differences):.1g} of the largest." if differences else ""
+    return (
+        f"**Cameras**: an emission every 10 ms, K = 400, stride 4, `split`, {events} events each. PyTorch is "
+        f"given its frames; one thread is timed by the processor, several by the clock.{agreement}\n\n"
+        + _table(("sensor", "", "time an emission", "slower"), rows)
+        + _missing(next(iter(part.values())))
     )
 
 
@@ -209,7 +233,7 @@ def _memory(part: dict[str, Any]) -> str:
     operator = next(iter(part.values()))["operator_bytes"] / 1e6
     return (
         "**Memory** of an engine for 640x480, downsample 4, stride 4, in MB. The minimum: `4 T H W` for "
-        "counts, `4 V K` for projections, `16 K` for pooled sums. The operator, "
+        "counts, `4 V K` for projections, looking ahead twice that, `16 K` for pooled sums. The operator, "
         f"{operator:.1f} MB, is shared and read-only.\n\n"
         + _table(("", "minimum", "state", "resident"), rows)
     )
@@ -276,6 +300,7 @@ def _missing(part: dict[str, Any]) -> str:
 TABLES = {
     "floors": _floors,
     "peers": _peers,
+    "cameras": _cameras,
     "inverse": _inverse,
     "ingest": _ingest,
     "latency": _latency,

@@ -72,7 +72,7 @@ MUTANTS = [
         "tests/test_narrow.py -k thousandths",
     ),
     Mutant(
-        "scales of the narrow state forget max_count",
+        "steps of the narrow state forget max_count",
         "engine/narrow.py",
         "lengths / (2 * room)) * most",
         "lengths / (2 * room))",
@@ -443,7 +443,7 @@ MUTANTS = [
     Mutant(
         "another kind is read",
         "files/safetensors_file.py",
-        'header.get("format") != kind',
+        'header.get("format") not in kinds',
         'header.get("format") is None',
         "tests/test_golden.py -k kind",
     ),
@@ -672,9 +672,9 @@ MUTANTS = [
     ),
     Mutant(
         "noise comes in the refractory time",
-        "simulate/saccades.py",
-        "kept = _outside_refractory(pixel, t, is_noise, camera.refractory_us)",
-        "kept = _outside_refractory(pixel, t, is_noise, 0)",
+        "simulate/camera.py",
+        "kept = _outside_refractory(known, self._model.resolution, dead_us)",
+        "kept = _outside_refractory(known, self._model.resolution, 0)",
         "tests/test_simulate.py",
     ),
     Mutant(

@@ -1,0 +1,138 @@
+"""Compiling on two cores: it leaves nothing to compile, ends when it is told, and is not needed twice."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tiny
+
+import streamfeat
+from streamfeat.kernels import cache
+from streamfeat.stream import compiling
+
+LEFT = """
+from numba.core import event
+
+compiled = []
+
+class Heard(event.Listener):
+    def on_start(self, told):
+        compiled.append(told.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, told):
+        pass
+
+from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.random_encoder import random_encoder
+from streamfeat.stream.compiling import compile_together, is_compiled
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.warming import warm_up
+
+assert not is_compiled()
+compile_together()
+assert is_compiled()
+event.register("numba:compile", Heard())
+encoder = random_encoder(0, Geometry(patch=6, n_bins=2, bin_us=5_000), 5, encoding="triangle")
+warm_up(encoder, EmitPolicy.parse("10ms"))
+print(*compiled)
+"""
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch):
+    """A cache without a kernel."""
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+
+@pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
+def test_nothing_is_left_to_compile(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", LEFT],
+        env=os.environ
+        | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(streamfeat.__file__).parent.parent)},
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=390,
+        check=False,
+    )
+    assert (done.returncode, done.stderr, done.stdout) == (0, "", "\n")
+
+
+@pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
+def test_the_processes_end_when_they_are_told(empty):
+    with compiling.Compilers() as compilers:
+        assert compilers.is_alive()
+        processes = list(compilers._started)
+        assert len(processes) == 2
+        compilers.wait(lambda: False)
+        assert compilers.is_alive()
+    assert all(process.returncode is not None for process in processes)
+    assert not compilers.is_alive()
+
+
+def test_a_half_does_not_wait_for_one_that_is_gone(empty, monkeypatch):
+    """Its input ends with the other process, whatever ended that."""
+    monkeypatch.setattr(compiling, "_cores", lambda: 2)
+    started = []
+
+    def start(self, half, stdin=None, stdout=None):
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                "import sys; sys.stdin.buffer.read()" if stdin else "import os; os.abort()",
+            ],
+            stdin=stdin or subprocess.DEVNULL,
+            stdout=stdout or subprocess.DEVNULL,
+        )
+        started.append(process)
+        self._started.append(process)
+        return process
+
+    monkeypatch.setattr(compiling.Compilers, "_start", start)
+    compiling.compile_together()
+    assert [process.returncode for process in started] == [-6, 0]
+
+
+@pytest.mark.parametrize("reason", ["compiled", "one core", "no interpreter", "no room for a process"])
+def test_no_process_where_it_would_be_of_no_use(empty, monkeypatch, reason):
+    def refuse(*arguments, **options):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(compiling, "_cores", lambda: 1 if reason == "one core" else 2)
+    if reason == "compiled":
+        monkeypatch.setattr(cache, "folder", lambda: None)
+    elif reason == "no interpreter":
+        monkeypatch.setattr(sys, "executable", "")
+    elif reason == "no room for a process":
+        monkeypatch.setattr(subprocess, "Popen", refuse)
+    with compiling.Compilers() as compilers:
+        assert not compilers.is_alive()
+        compilers.wait()
+
+
+@pytest.mark.parametrize("command", ["replay", "train", "latency", "evaluate"])
+def test_a_pipe_is_told_why_nothing_comes(run, tmp_path, monkeypatch, command):
+    """Once, where kernels are not compiled yet; not where they are, nor where the summary alone is wanted."""
+    recording = tiny.write_items(tmp_path / "rec.mcap", tiny.labelled_items(24))
+    model = tmp_path / "model"
+    tiny.encoder(k=3).save(model)
+    line = [command, recording, "-m", model, "--json"]
+    line += {
+        "train": ["-o", tmp_path / "c", "--overwrite", "--groups", "none"],
+        "evaluate": ["--folds", 2],
+    }.get(command, [])
+    line += {"latency": ["--warm-up", 1, "--limit-events", 9, "--seconds", 1]}.get(command, [])
+    monkeypatch.setattr(compiling, "_cores", lambda: 1)  # nothing is started
+    told = {}
+    for compiled in (True, False):
+        monkeypatch.setattr(compiling, "is_compiled", lambda compiled=compiled: compiled)
+        told[compiled] = run(*line)
+        assert told[compiled].status == 0, told[compiled].err
+    assert "compiling" not in told[True].err
+    assert told[False].err.count("compiling: kernels, once for this version") == 1
+    assert "compiling" not in run(*line, "--quiet").err
