@@ -97,6 +97,30 @@ def pool_volume(
 
 
 @kernel
+def read_cell(cell: int, operator: Operator, state: State, features: NDArray[np.float32]) -> None:
+    """Write the pooled sums of one cell of the current plane as floats, without padding.
+
+    Args:
+        cell: which.
+        operator: number of filters, encoding and fixed point.
+        state: not changed.
+        features: as for `read_features`; those of the cell are overwritten.
+    """
+    pooled, n = state.pooled[state.clock[CLOCK_PLANE], cell], operator.n_filters
+    width, per_unit = operator.offset.shape[0], 1.0 / operator.unit
+    if operator.kind == SPLIT:
+        sums, sizes = pooled[:width], pooled[width:]
+        positive, negative = features[2 * cell * n : (2 * cell + 1) * n], features[(2 * cell + 1) * n :]
+        for k in range(n):
+            positive[k] = np.float32((np.int64(sizes[k]) + sums[k]) // 2 * per_unit)
+        for k in range(n):
+            negative[k] = np.float32((np.int64(sizes[k]) - sums[k]) // 2 * per_unit)
+    else:
+        for k in range(n):
+            features[cell * n + k] = np.float32(pooled[k] * per_unit)
+
+
+@kernel
 def read_features(operator: Operator, state: State, features: NDArray[np.float32]) -> None:
     """Write the pooled sums of the current plane as floats, cell by cell and without padding.
 
@@ -106,16 +130,5 @@ def read_features(operator: Operator, state: State, features: NDArray[np.float32
         features: `(cells * K,)`, or `(cells * 2 K,)` for SPLIT, in each cell positive parts before negative
             ones; overwritten.
     """
-    pooled, n = state.pooled[state.clock[CLOCK_PLANE]], operator.n_filters
-    width, per_unit = operator.offset.shape[0], 1.0 / operator.unit
-    for q in range(pooled.shape[0]):
-        if operator.kind == SPLIT:
-            sums, sizes = pooled[q, :width], pooled[q, width:]
-            positive, negative = features[2 * q * n : (2 * q + 1) * n], features[(2 * q + 1) * n :]
-            for k in range(n):
-                positive[k] = np.float32((np.int64(sizes[k]) + sums[k]) // 2 * per_unit)
-            for k in range(n):
-                negative[k] = np.float32((np.int64(sizes[k]) - sums[k]) // 2 * per_unit)
-        else:
-            for k in range(n):
-                features[q * n + k] = np.float32(pooled[q, k] * per_unit)
+    for cell in range(state.pooled.shape[1]):
+        read_cell(cell, operator, state, features)

@@ -1,11 +1,11 @@
 """Short vector code that a loop in Python cannot be made to compile to.
 
-Lives here: four functions written in LLVM's own terms, each for a line or a block of int16 numbers.
+Lives here: functions written in LLVM's own terms, each for a line or a block of numbers.
 Not here: what the numbers mean (`volume`).
 
 The code names no processor. LLVM finds the instruction: products of pairs and their sum are `vpdpwssd` with
 AVX-512 VNNI, `vpmaddwd` with AVX2, `pmaddwd` with SSE2, and plain multiplications elsewhere. All of them
-are exact, so the bits are the same everywhere.
+are exact, so the bits are the same everywhere. Floats are summed in an order that is written down.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from numba.core import cgutils
 
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_pairs"]
+__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_pairs", "sum_products"]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
@@ -200,3 +200,49 @@ def _product_of_pairs(builder: Any, numbers: Any, factors: Any) -> Any:
     products = builder.mul(builder.sext(numbers, wide), builder.sext(factors, wide))
     even, odd = (builder.shuffle_vector(products, products, _order(list(range(i, BLOCK, 2)))) for i in (0, 1))
     return builder.add(even, odd)
+
+
+_FLOATS = 16
+"""Floats in one vector of `sum_products`; two of them are summed side by side."""
+
+
+@generated
+def sum_products(typing: Any, one: Any, start: Any, other: Any, begin: Any, n: Any) -> Any:
+    """Sum of `one[start + i] * other[begin + i]` over `n` float32 numbers, a multiple of 32; in this order.
+
+    Lane `j` of 32 sums products `j`, `j + 32`, and so on, each product and each sum rounded. Then the upper
+    half of the lanes is added to the lower one, until one is left.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds, lanes = signature.args, ir.VectorType(ir.FloatType(), _FLOATS)
+        arrays = [context.make_array(kinds[i])(context, builder, arguments[i]) for i in (0, 2)]
+        before = builder.block
+        head, body, done = (builder.append_basic_block(name) for name in ("products", "product", "summed"))
+        builder.branch(head)
+        builder.position_at_end(head)
+        index, *totals = (builder.phi(kind) for kind in (_I64, lanes, lanes))
+        for phi in (index, *totals):
+            phi.add_incoming(ir.Constant(phi.type, None if phi.type is lanes else 0), before)
+        builder.cbranch(builder.icmp_signed("<", index, arguments[4]), body, done)
+
+        builder.position_at_end(body)
+        for half, total in enumerate(totals):
+            offset = builder.add(index, _int64(half * _FLOATS))
+            factors = [
+                _load(builder, array, builder.add(arguments[first], offset), lanes, align=4)
+                for array, first in zip(arrays, (1, 3), strict=True)
+            ]
+            total.add_incoming(builder.fadd(total, builder.fmul(*factors)), body)
+        index.add_incoming(builder.add(index, _int64(2 * _FLOATS)), body)
+        builder.branch(head)
+
+        builder.position_at_end(done)
+        left, width = builder.fadd(*totals), _FLOATS
+        while width > 1:
+            width //= 2
+            halves = [_order(list(range(at, at + width))) for at in (0, width)]
+            left = builder.fadd(*(builder.shuffle_vector(left, left, half) for half in halves))
+        return builder.extract_element(left, ir.Constant(_I32, 0))
+
+    return types.float32(one, types.int64, other, types.int64, types.int64), generate

@@ -13,6 +13,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.json_fields import Fields
+from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.codecs import (
     EVT3_WRAP_US,
@@ -127,6 +128,8 @@ class PacketReader:
         encoding: of the latest message.
         resolution: `(height, width)` of the latest message that could be decoded; None before it.
         time_us: the time that the latest message gave for itself; None where it has none.
+        n_inside: how many events of the latest message are on the sensor.
+        span: `(2,)` int64, their earliest and latest time; as it was where there are none.
     """
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -134,6 +137,8 @@ class PacketReader:
         self.encoding = ""
         self.resolution: Resolution | None = None
         self.time_us: int | None = None
+        self.n_inside = 0
+        self.span = np.zeros(2, np.int64)
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
@@ -156,6 +161,7 @@ class PacketReader:
         if isinstance(content, EventArray):
             self.resolution = _resolution(content.height, content.width)
             self.encoding, self.time_us = schema.partition("/")[0], None
+            self.n_inside = time_span(content.events, *self.resolution, self.span)
             return content.events
         if self._last_seq is not None and content.seq > self._last_seq + 1:
             self.resync()
@@ -166,7 +172,8 @@ class PacketReader:
         decoder = self._decoders.get(content.encoding)
         if decoder is None:
             decoder = self._decoders[content.encoding] = make_decoder(content.encoding, self._max_events)
-        events = decoder.decode(content.events, content.time_base)
+        events = decoder.decode(content.events, content.time_base, resolution)
+        self.n_inside, self.span = decoder.n_inside, decoder.span
         if isinstance(decoder, Evt3Decoder) and len(events):
             self._place(decoder, events, content.stamp_ns)
         self.encoding, self.resolution = content.encoding, resolution
@@ -215,6 +222,7 @@ class PacketReader:
             if 0 < wraps <= _MOST_WRAPS:
                 decoder.count_wraps(wraps)
                 events["t"] += wraps * EVT3_WRAP_US
+                decoder.span += wraps * EVT3_WRAP_US
         self._is_broken = False
         self._before = stamp_ns, int(events["t"][-1])
 
