@@ -32,6 +32,7 @@ __all__ = [
     "MAX_PIXELS",
     "MAX_STREAM_US",
     "Content",
+    "Item",
     "Label",
     "Packet",
     "PacketReader",
@@ -116,6 +117,10 @@ class Label:
                 f"0 and {MAX_STREAM_US} us"
             )
         return cls(start_us, duration_us, m.label, m.split, m.source, topic)
+
+
+Item = Packet | Label
+"""What comes out of a timeline."""
 
 
 class PacketReader:

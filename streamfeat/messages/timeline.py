@@ -23,7 +23,7 @@ from streamfeat.messages.clock import CameraClock
 from streamfeat.messages.codecs import MAX_PACKET_EVENTS
 from streamfeat.messages.delivery import Delivery, Verdict, fingerprint_of
 from streamfeat.messages.event_messages import parse_events
-from streamfeat.messages.packets import MAX_STREAM_US, Content, Label, Packet, PacketReader
+from streamfeat.messages.packets import MAX_STREAM_US, Content, Item, Label, Packet, PacketReader
 from streamfeat.messages.strays import BACK_US, STEP_US
 
 __all__ = ["HOLD_NS", "TIMELINE_COUNTS", "Timeline"]
@@ -47,7 +47,6 @@ _CLOCK_COUNTS = ("restarts", "jumps", "wraps", "steps back", "stray packets", "s
 
 HOLD_NS = 1_500_000_000
 """A packet is held no longer than this: packets of a camera that is awake are at most a second apart."""
-_Item = Packet | Label
 _MOST_BEHIND = 256
 """Labels and empty packets that wait behind a held packet; one more, and it is used."""
 
@@ -243,7 +242,7 @@ class Timeline:
         arrived.first_us, arrived.last_us = reader.span.tolist()
         return self._take(arrived, reader.n_inside, is_late=seen.late, is_message=True)
 
-    def packet(self, packet: Packet) -> list[_Item]:
+    def packet(self, packet: Packet) -> list[Item]:
         """Take in a packet of a camera file, and give what is certain now."""
         log_ns, events = packet.log_time_ns, np.require(packet.events, requirements=["C", "A", "W"])
         about = events, packet.resolution, log_ns, packet.seq, packet.source_ns, log_ns
@@ -258,8 +257,8 @@ class Timeline:
         """Nothing follows: what is held was real."""
         return self._settled(None)
 
-    def _take(self, arrived: Arrived, n_inside: int, *, is_late: bool, is_message: bool) -> list[_Item]:
-        done: list[_Item] = []
+    def _take(self, arrived: Arrived, n_inside: int, *, is_late: bool, is_message: bool) -> list[Item]:
+        done: list[Item] = []
         if self._held and arrived.now_ns - self._held.now_ns > HOLD_NS:
             done += self._settled(None)
         if is_message and self._reader.encoding == "evt3" and self.reached_us is not None:
