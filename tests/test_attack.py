@@ -16,9 +16,12 @@ from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
-from streamfeat.messages.packets import MAX_LABEL_TEXT, Label
+from streamfeat.messages.packets import MAX_LABEL_TEXT, Label, Packet
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.cameras import Cameras
+from streamfeat.stream.emission import EmitPolicy
+from streamfeat.stream.session import Session
 
 ROOT = Path(__file__).parents[1]
 
@@ -114,6 +117,35 @@ def test_a_class_that_may_not_be_entered_is_said(tmp_path):
     (tmp_path / "set" / "dog").mkdir(mode=0)
     with pytest.raises(InputError, match=r"dog: cannot be entered"):
         find_samples(tmp_path / "set", (".mcap",))
+
+
+# --- one camera ends no other
+
+
+def test_a_camera_for_which_there_is_no_memory_is_refused_alone(model):
+    """Twenty of 2048x2048 within 8 GB ended the listener."""
+    refused = []
+
+    def session(topic):
+        return Session(tiny.encoder(), EmitPolicy.parse("10ms"), topic=topic, engine=engine_of(topic))
+
+    def engine_of(topic):
+        def make(*arguments, **options):
+            if topic == "large":
+                raise MemoryError("Unable to allocate 3 GiB")
+            return Engine(*arguments, **options)
+
+        return make
+
+    cameras = Cameras(session, on_refusal=lambda *told: refused.append(told))
+    emissions = []
+    for i in range(3):
+        for topic in ("large", "small"):
+            events = tiny.stream(range(i * 20_000, i * 20_000 + 15_000, 100))
+            emissions += cameras.process(Packet(topic, events, tiny.RESOLUTION, 0, i))
+    assert {emission.topic for emission in emissions} == {"small"}
+    assert set(refused) == {("large", "out of memory", "Unable to allocate 3 GiB")}
+    assert cameras.topics == ["small"]
 
 
 # --- pipes as inputs
