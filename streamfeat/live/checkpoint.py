@@ -164,7 +164,7 @@ def _write_state(path: Path, fingerprint: str, kept: _Kept) -> None:
         "topics": [{"topic": topic, **values} for topic, values in kept.topics.items()],
         "cameras": [{"topic": topic, **_to_json(session)} for topic, session in kept.cameras.items()],
     }
-    write_safetensors(path, _KIND, _VERSION, arrays, header)
+    write_safetensors(path, _KIND, _VERSION, arrays, header, private=True)
 
 
 def _scales(name: str, engine: Snapshot) -> Iterator[tuple[str, Snapshot]]:

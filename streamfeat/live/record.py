@@ -105,6 +105,7 @@ class RecordJob:
                         compression=self._compression,
                         overwrite=self._overwrite,
                         keep_partial=True,
+                        private=True,
                     )
                 )
             )

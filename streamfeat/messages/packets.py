@@ -28,6 +28,7 @@ from streamfeat.messages.event_messages import EVENT_SCHEMAS
 
 __all__ = [
     "EVENT_SCHEMAS",
+    "MAX_LABEL_TEXT",
     "MAX_LABEL_US",
     "MAX_PIXELS",
     "MAX_STREAM_US",
@@ -48,6 +49,8 @@ _LARGEST = 1 << 62  # of a number in a snapshot
 MAX_PIXELS = 1 << 22
 """Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
 MAX_LABEL_US = 3_600_000_000
+MAX_LABEL_TEXT = 4096
+"""Characters of each text of a label, which each emission of its sample says again."""
 """The longest labelled sample of a live topic."""
 MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US
 """The latest time of a message: times go into message stamps, which have 31 bits of seconds."""
@@ -107,7 +110,8 @@ class Label:
         """Read a `streamfeat_msgs/msg/Label`.
 
         Raises:
-            InputError: the bytes are no such message, or its times cannot be those of a message.
+            InputError: the bytes are no such message, its times cannot be those of a message, or a text has
+                more than `MAX_LABEL_TEXT` characters.
         """
         m = LabelMessage.from_cdr(data)
         start_us, duration_us = m.stamp_ns // 1000, m.duration_ns // 1000
@@ -116,6 +120,9 @@ class Label:
                 f"label {m.label[:40]!r} from {start_us} us on, {duration_us} us long: times lie between "
                 f"0 and {MAX_STREAM_US} us"
             )
+        longest = max(len(text) for text in (m.label, m.split, m.source))
+        if longest > MAX_LABEL_TEXT:
+            raise InputError(f"a label with a text of {longest} characters; at most {MAX_LABEL_TEXT}")
         return cls(start_us, duration_us, m.label, m.split, m.source, topic)
 
 

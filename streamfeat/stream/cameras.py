@@ -99,8 +99,8 @@ class Cameras(Emitter):
             return
         try:
             yield from session.batches(item)
-        except InputError as error:
-            self._refuse(item.topic, "unusable", str(error))
+        except (InputError, MemoryError) as error:
+            self._refuse(item.topic, _reason(error), str(error))
             self._past = _sum([self._past, session.stats()])
             del self._sessions[item.topic]
 
@@ -120,8 +120,8 @@ class Cameras(Emitter):
             return
         try:
             yield from session.last_batches()
-        except InputError as error:
-            self._refuse(topic, "unusable", str(error))
+        except (InputError, MemoryError) as error:
+            self._refuse(topic, _reason(error), str(error))
         finally:
             self._past = _sum([self._past, session.stats()])
             del self._sessions[topic]
@@ -129,6 +129,11 @@ class Cameras(Emitter):
     def _refuse(self, topic: str, reason: str, error: str) -> None:
         self.refused[reason] += 1
         self._on_refusal(topic, reason, error)
+
+
+def _reason(error: BaseException) -> str:
+    """Why a camera is refused; one for which there is no memory leaves that of the others alone."""
+    return "out of memory" if isinstance(error, MemoryError) else "unusable"
 
 
 def _sum(parts: list[SessionStats]) -> SessionStats:
