@@ -1131,6 +1131,53 @@ FOLLOW_CHANGES = {
     ),
 }
 
+NARROW_GAIN = {
+    "a shift": lambda call: call.result % 2**16 > 0,
+    "no shift": lambda call: call.result % 2**16 == 0 and call.result >> 16 >= 2**14,
+    "less than a quarter": lambda call: call.result >> 16 < 2**14,
+}
+
+MOVE_QUEUED = {
+    "no volume waits": lambda call: call.state.queued[call.part, 0] == 0,
+    "sums of columns": lambda call: (
+        call.state.queued[call.part, 0] > 0 and call.state.queued[call.part, 3] == 0
+    ),
+    "columns that are added": lambda call: (
+        call.state.queued[call.part, 0] > 0 < call.state.queued[call.part, 3]
+    ),
+    "columns that are subtracted": lambda call: call.state.queued[call.part, 3] < 0,
+    "several volumes": lambda call: call.state.queued[call.part, 0] > 1,
+    "of another part": lambda call: call.state.queued[call.part, 0] > 0 < call.part,
+}
+
+QUEUE_VOLUME = {
+    "no volume waits": lambda call: call.state.queued[call.part, 0] == 0,
+    "those of another cell wait": lambda call: (
+        call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 2] != call.state.cells[call.volume]
+    ),
+    "those of its cell wait": lambda call: (
+        call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 2] == call.state.cells[call.volume]
+    ),
+    "for other columns": lambda call: (
+        call.n == 1
+        and call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 3] != call.state.changes[call.part, 0]
+    ),
+    "one column": lambda call: call.n == 1 and abs(call.state.changes[call.part, 0]) == 1,
+    "several": lambda call: call.n > 1,
+}
+
+
+def _states(more=None):
+    return {
+        "narrow": lambda call: call.operator.scales is not None,
+        "wide": lambda call: call.operator.scales is None,
+        **(more or {}),
+    }
+
+
 LIST_MISSING = {
     "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
     "all are missing": lambda call: _current(call)[CURSOR_CODED] == 0,
@@ -1168,6 +1215,24 @@ SUM_COLUMNS = {
 
 CASES = {
     "follow_changes": FOLLOW_CHANGES,
+    "narrow_gain": NARROW_GAIN,
+    "move_queued": MOVE_QUEUED,
+    "queue_volume": QUEUE_VOLUME,
+    "follow_rest": _states(),
+    "enter_atoms": _states({"inverse": lambda call: call.operator.inverse}),
+    "write_code": _states({"inverse": lambda call: call.operator.inverse}),
+    "pool_row_of": _states(
+        {
+            "empty": lambda call: not call.state.moments[call.plane, call.row, MOMENT_SQUARES],
+            "triangle": lambda call: call.operator.kind == TRIANGLE,
+        }
+    ),
+    "write_features": _states(
+        {
+            "soft": lambda call: call.operator.kind == SOFT,
+            "split": lambda call: call.operator.kind == SPLIT,
+        }
+    ),
     "list_missing": LIST_MISSING,
     "list_entries": LIST_ENTRIES,
     "touched_bins": TOUCHED_BINS,
@@ -1222,7 +1287,7 @@ CASES = {
     "move_volume": MOVE_VOLUME,
     "move_code": MOVE_CODE,
     "change_moments": FORMS,
-    "renew": RENEW,
+    "renew": RENEW | _states(),
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
     "fire_pixels": FIRE_PIXELS,

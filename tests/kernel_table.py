@@ -27,6 +27,7 @@ from streamfeat.kernels import (
     follow,
     ingest,
     lasso,
+    narrow,
     pixels,
     planes,
     predict,
@@ -68,6 +69,9 @@ SCRATCH = {
     "values",
     "entries",
     "changes",
+    "sums",
+    "queue",
+    "queued",
     "lines",
     "crowds",
 }
@@ -171,6 +175,14 @@ def exact_but_atoms_of_a_part(kernel: Run, twin: Run) -> None:
                     naive.complete(other, parts, operator, state)
             naive.finish(parts, operator, state)
     exact_but_atoms(kernel, twin)
+
+
+def exact_but_responses(kernel: Run, twin: Run) -> None:
+    """As `exact_but_scratch`, but for the order of the sums of a response."""
+    mine, yours = (run.after[-1].atoms for run in (kernel, twin))
+    np.testing.assert_allclose(mine, yours, rtol=1e-12, atol=1e-12)
+    yours[:] = mine
+    exact_but_scratch(kernel, twin)
 
 
 def exact_list(kernel: Run, twin: Run) -> None:
@@ -329,8 +341,15 @@ def pick(rng, options):
     return options[rng.integers(len(options))]
 
 
-def random_engine(rng, kinds=KINDS):
-    """A small engine with events in all of its window, read at some moment or never."""
+NARROW_KINDS = [("direct", "soft"), ("direct", "split")]
+"""Formulations and encodings that have a narrow state."""
+
+
+def random_engine(rng, kinds=KINDS, narrow=None):
+    """A small engine with events in all of its window, read at some moment or never.
+
+    In the narrow state or not; in half of the cases, where it can be, if that is not said.
+    """
     geometry = Geometry(
         patch=int(pick(rng, [1, 2, 3, 4, 9])),
         stride=int(rng.integers(1, 6)),
@@ -347,7 +366,11 @@ def random_engine(rng, kinds=KINDS):
     formulation, encoding = pick(rng, kinds)
     threshold = float(pick(rng, [0.02, 0.3]))
     n_filters = int(pick(rng, [1, 5, 32, 33]))
-    encoder = random_encoder(rng, geometry, n_filters, formulation, encoding, threshold=threshold)
+    if narrow is None:
+        narrow = rng.random() < 0.5
+    encoder = random_encoder(
+        rng, geometry, n_filters, formulation, encoding, threshold=threshold, narrow=narrow
+    )
     ahead = bool(rng.random() < 0.7)
     engine = Engine(
         encoder,
@@ -373,12 +396,12 @@ def bin_start(engine, ahead=0):
     return int(clock[CLOCK_ORIGIN]) + (now + ahead) * engine.encoder.geometry.bin_us
 
 
-def read_engine(rng, kinds=KINDS, *, more=0):
+def read_engine(rng, kinds=KINDS, *, more=0, narrow=None):
     """A random engine whose sums are current, the next bin partly prepared.
 
     With `more` events counted since, none of them in a new bin.
     """
-    engine = random_engine(rng, kinds)
+    engine = random_engine(rng, kinds, narrow)
     engine.advance(0)
     engine.features()
     engine.prepare(int(pick(rng, [-1, 1, 30, 300, 10**6])))
@@ -403,7 +426,7 @@ def random_values(rng, operator):
 
 def random_volume(rng, kinds=KINDS):
     """An operator and the projection and moments of one random volume that is not empty."""
-    operator = random_engine(rng, kinds)._operator
+    operator = random_engine(rng, kinds, narrow=False)._operator
     values = random_values(rng, operator)
     values[0] = values[0] or 1
     projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
@@ -816,7 +839,7 @@ def make_lasso_code(rng):
 
 
 def make_fix_atoms(rng):
-    operator = random_engine(rng, LASSO_KINDS)._operator
+    operator = random_engine(rng, LASSO_KINDS, narrow=False)._operator
     k, scale = operator.n_filters, pick(rng, [1, 1e9])
     atoms = scale * rng.normal(size=k)
     return atoms, operator, random_code(rng, len(operator.offset))
@@ -885,14 +908,13 @@ def rewind(rng, plane, operator, state):
         cursors[:] = (coded, projected + 1, 0) if following == end else (coded, projected, following)
     state.pooled[plane] = 0
     for row in range(coded):
+        sums = state.pooled[plane, naive.cell_index(row, operator.shape, operator.pooling)]
+        if operator.scales is not None:
+            naive.pool_row_of(None, None, plane, row, 1, 0, operator, state, sums)
+            continue
         row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
         naive.encode_volume(*row_of, False, 0, operator, state)
-        naive.pool(
-            state.code[0, 0],
-            1,
-            operator.kind,
-            state.pooled[plane, naive.cell_index(row, operator.shape, operator.pooling)],
-        )
+        naive.pool(state.code[0, 0], 1, operator.kind, sums)
 
 
 def random_part(rng, state):
@@ -920,6 +942,11 @@ def make_project_volume(rng):
         volume, start = min(int(state.cursors[plane, 1]), volumes - 1), int(state.cursors[plane, 2])
     ahead = int(plane != state.clock[CLOCK_PLANE])
     return plane, volume, ahead, start, random_most(rng), part, operator, state
+
+
+def make_enter_atoms(rng):
+    operator, state = parts_of(read_engine(rng))
+    return operator.wide, *random_row(rng, state), random_part(rng, state), operator, state
 
 
 def make_enter_code(rng):
@@ -1060,11 +1087,13 @@ def changed_place(rng, operator, state):
     return position, row, column
 
 
-def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False):
-    operator, state = parts_of(read_engine(rng, kinds))
+def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False, narrow=None):
+    operator, state = parts_of(read_engine(rng, kinds, narrow=narrow))
+    if narrow and operator.scales is None:
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     places = [place for place in in_planes(state) if not stays or state.moments[place][MOMENT_SQUARES] > 0]
     if not places:
-        return make_change_volume(rng, kinds, stays=stays)
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     plane, volume = pick(rng, places)
     part, ahead = random_part(rng, state), int(plane != state.clock[CLOCK_PLANE])
     values = naive._gather(state.applied, ahead, volume, operator, state)
@@ -1077,14 +1106,162 @@ def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False):
     after = values.copy()
     after[listed] = [one_step(rng, int(values[entry]), operator) for entry in listed]
     if stays and not after.any():
-        return make_change_volume(rng, kinds, stays=stays)
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     state.entries[part, : len(listed)] = listed
     state.changes[part, : len(listed)] = (after - values)[listed]
     return plane, volume, len(listed), part, operator, state
 
 
 def make_move_volume(rng):
-    return make_change_volume(rng, [kind for kind in EXACT_KINDS if kind[0] == "direct"], stays=True)
+    kinds = [kind for kind in EXACT_KINDS if kind[0] == "direct"]
+    return make_change_volume(rng, kinds, stays=True, narrow=False)
+
+
+def make_queue_volume(rng):
+    plane, volume, n, part, operator, state = make_change_volume(rng, NARROW_KINDS, stays=True, narrow=True)
+    wait = rng.random()
+    if wait < 0.7:  # others wait, of this volume's cell or of another, or as many as can
+        cell = naive.cell_index(volume, operator.shape, operator.pooling)
+        mine = [v for v in waiting(rng, plane, operator, state) if v != volume]
+        if not mine:
+            return make_queue_volume(rng)
+        sign = int(pick(rng, [-1, 0, 1]))
+        one_cell = [v for v in mine if (state.cells[v] == cell) == (wait < 0.5)] or mine
+        fill_queue(rng, plane, one_cell, sign, part, operator, state)
+    return plane, volume, n, part, operator, state
+
+
+def waiting(rng, plane, operator, state):
+    """Volumes that have a code in a plane and are not empty, in any order."""
+    found = [v for p, v in in_planes(state) if p == plane and state.moments[plane, v][MOMENT_SQUARES] > 0]
+    return rng.permutation(found).astype(int).tolist()
+
+
+def fill_queue(rng, plane, volumes, sign, part, operator, state):
+    """Let volumes of one cell wait, whose moments have changed but whose projections have not."""
+    width, limit = operator.columns.shape[1], operator.max_count
+    ahead, n, cell = int(plane != state.clock[CLOCK_PLANE]), 0, state.cells[volumes[0]]
+    most = pick(rng, [1, 3, state.queue.shape[1]])
+    for mine in volumes:
+        values = naive._gather(state.applied, ahead, mine, operator, state)
+        moments = state.moments[plane, mine]
+        open_ = np.flatnonzero(values * (sign or 1) < limit)
+        if state.cells[mine] != cell or not len(open_) or n == most:
+            continue
+        entry = int(pick(rng, open_))
+        after = values.copy()
+        after[entry] += sign or 1
+        if not after.any() or (values != _entries_of(plane, mine, operator, state)).any():
+            continue
+        before = naive.narrow_gain(moments, operator)
+        moments[:] = naive.sums_of(after, operator)[1]
+        column = operator.columns[entry]
+        state.sums[part, n + 1] = column
+        place = entry * width if sign else (n + 1) * width
+        row = (plane * state.projections.shape[1] + mine) * width
+        state.queue[part, n] = place, row, before + 2**32 * naive.narrow_gain(moments, operator)
+        n += 1
+    state.queued[part] = n, plane, cell, sign
+
+
+def _entries_of(plane, volume, operator, state):
+    """The entries that a volume's projection stands for."""
+    values = naive._gather(state.applied, int(plane != state.clock[CLOCK_PLANE]), volume, operator, state)
+    values[naive._entries_in(plane, volume, state) :] = 0
+    return values
+
+
+def make_move_queued(rng):
+    operator, state = parts_of(read_engine(rng, NARROW_KINDS, narrow=True))
+    plane, part = int(rng.integers(0, len(state.cursors))), random_part(rng, state)
+    if operator.scales is None or not (volumes := waiting(rng, plane, operator, state)):
+        return make_move_queued(rng)
+    if rng.random() < 0.8:
+        fill_queue(rng, plane, volumes, int(pick(rng, [-1, 0, 1])), part, operator, state)
+    return part, operator, state
+
+
+def make_follow_rest(rng):
+    if rng.random() < 0.3:
+        operator, state = parts_of(read_engine(rng, narrow=False))
+        return None, random_part(rng, state), operator, state
+    part, operator, state = make_move_queued(rng)
+    return operator.upper, part, operator, state
+
+
+def make_move_rows(rng):
+    part, operator, state = make_move_queued(rng)
+    n, plane, cell, sign = state.queued[part].tolist()
+    columns = operator.columns if sign else state.sums[part]
+    rows, sums = state.projections.reshape(-1), state.pooled[plane, cell]
+    return n, sign, state.queue[part], columns.reshape(-1), rows, operator.upper, operator.lower, sums
+
+
+def narrow_volume(rng):
+    """As `random_volume`, in the narrow state."""
+    operator = random_engine(rng, NARROW_KINDS, narrow=True)._operator
+    if operator.scales is None:
+        return narrow_volume(rng)
+    values = random_values(rng, operator)
+    values[0] = values[0] or 1
+    projection, moments = naive.sums_of(values, operator)
+    return operator, projection.astype(np.int16), moments
+
+
+def make_narrow_gain(rng):
+    operator, _, moments = narrow_volume(rng)
+    return moments, operator
+
+
+def make_narrow_code(rng):
+    operator, projection, moments = narrow_volume(rng)
+    code = random_code(rng, len(projection))
+    return naive.narrow_gain(moments, operator), projection, operator.upper, operator.lower, code
+
+
+def make_pool_narrow(rng):
+    *row, _ = make_narrow_code(rng)
+    pooled = rng.integers(-(2**30), 2**30, 2 * len(row[1])).astype(np.int32)
+    return int(pick(rng, [-1, 1])), *row, pooled
+
+
+def states_of(operator):
+    """The first arguments of what is compiled for one of the two states."""
+    return operator.upper, operator.wide
+
+
+def make_follow_changes(rng):
+    *arguments, operator, state = make_change_volume(rng)
+    return *states_of(operator), *arguments, operator, state
+
+
+def exact_once_moved(kernel: Run, twin: Run) -> None:
+    """As `exact_but_scratch`, once the queues are empty; of the twin, too, where others waited before."""
+    for run in (kernel, twin):
+        operator, state = run.after[-2:]
+        if operator.scales is not None:
+            for part in range(len(state.queued)):
+                naive.move_queued(part, operator, state)
+        naive.add_up(len(state.code), state)
+    exact_but_scratch(kernel, twin)
+
+
+def make_write_code(rng):
+    arguments = make_encode_volume(rng)
+    while not arguments[1][MOMENT_SQUARES]:
+        arguments = make_encode_volume(rng)
+    return *states_of(arguments[-2]), *arguments
+
+
+def make_pool_row_of(rng):
+    plane, volume, _, sign, part, operator, state = make_pool_volume(rng)
+    sums = np.zeros_like(state.pooled[0, 0])
+    return *states_of(operator), plane, volume, sign, part, operator, state, sums
+
+
+def make_write_features(rng):
+    operator, state, features = make_read_features(rng)
+    return operator.scales, operator.wide, operator, state.pooled[0].copy(), features
 
 
 def make_change_place(rng):
@@ -1224,7 +1401,13 @@ def make_sum_columns(rng):
     if int(np.abs(changes[:n].astype(np.int64)).sum()) * 32767 >= 2**31:  # an operator allows no such sum
         changes = np.sign(changes)
     entries = np.append(rng.permutation(d), 0).astype(np.int32)
-    return n, entries, changes, frozen(columns), random_code(rng, width)
+    return (
+        n,
+        entries,
+        changes,
+        frozen(columns),
+        random_code(rng, width).astype(pick(rng, [np.int32, np.int16])),
+    )
 
 
 def sums_only(kernel: Run, twin: Run) -> None:
@@ -1442,7 +1625,17 @@ KERNELS = [
     Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
     Row(encode.read_cell, make_read_cell),
     Row(encode.read_features, make_read_features),
+    Row(encode.write_code, make_write_code),
+    Row(encode.pool_row_of, make_pool_row_of, exact_but_scratch),
+    Row(encode.write_features, make_write_features),
+    Row(narrow.narrow_gain, make_narrow_gain),
+    Row(narrow.narrow_code, make_narrow_code),
+    Row(narrow.pool_narrow, make_pool_narrow),
+    Row(narrow.move_rows, make_move_rows),
+    Row(narrow.move_queued, make_move_queued, exact_but_scratch),
+    Row(narrow.queue_volume, make_queue_volume, exact_once_moved),
     Row(planes.project_volume, make_project_volume, exact_but_scratch),
+    Row(planes.enter_atoms, make_enter_atoms, exact_but_responses),
     Row(planes.enter_code, make_enter_code, exact_but_scratch),
     Row(planes.count_filled, make_count_filled, exact_but_lines),
     Row(planes.list_missing, make_list_missing, exact_list),
@@ -1459,7 +1652,8 @@ KERNELS = [
     Row(update.read, make_read, exact_but_features),
     Row(change.change_volume, make_change_volume, exact_but_scratch),
     Row(change.move_volume, make_move_volume, exact_but_scratch),
-    Row(change.follow_changes, make_change_volume, exact_but_scratch),
+    Row(change.follow_changes, make_follow_changes, exact_once_moved),
+    Row(change.follow_rest, make_follow_rest, exact_but_scratch),
     Row(change.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),

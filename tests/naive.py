@@ -617,6 +617,14 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
         if fresh:
             atoms[:] = 0
         return
+    write_code(None, None, projection, moments, atoms, fresh, part, operator, state)
+
+
+def write_code(narrow, wide, projection, moments, atoms, fresh, part, operator, state):
+    code = state.code[part, 0]
+    if operator.scales is not None:
+        narrow_code(narrow_gain(moments, operator), projection, operator.upper, operator.lower, code)
+        return
     sigma = deviation(moments, len(operator.columns), operator.eps)
     square = whitened_square(moments, sigma, operator)
     if operator.inverse:
@@ -630,11 +638,8 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
 
 
 def pool_volume(plane, row, volume, sign, part, operator, state):
-    row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
-    encode_volume(*row_of, sign > 0, part, operator, state)
-    sums = [state.pooled, *state.partial][part]
-    cell_of_volume = cell_index(volume, operator.shape, operator.pooling)
-    pool(state.code[part, 0], sign, operator.kind, sums[plane, cell_of_volume])
+    sums = [state.pooled, *state.partial][part][plane, cell_index(volume, operator.shape, operator.pooling)]
+    pool_row_of(None, None, plane, row, sign, part, operator, state, sums)
     state.encoded[part] += sign > 0
 
 
@@ -645,13 +650,90 @@ def read_cell(cell, operator, state, features):
     features.reshape(cells, -1)[cell] = whole.reshape(cells, -1)[cell]
 
 
+def pool_row_of(narrow, wide, plane, row, sign, part, operator, state, sums):
+    projection, moments, atoms = (
+        field[plane, row] for field in (state.projections, state.moments, state.atoms)
+    )
+    if operator.scales is None:
+        encode_volume(projection, moments, atoms, sign > 0, part, operator, state)
+        pool(state.code[part, 0], sign, operator.kind, sums)
+    elif moments[MOMENT_SQUARES]:
+        pool_narrow(sign, narrow_gain(moments, operator), projection, operator.upper, operator.lower, sums)
+
+
 def read_features(operator, state, features):
-    pooled = state.pooled[int(state.clock[CLOCK_PLANE])].astype(np.int64)
-    parts = pooled.reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
+    write_features(None, None, operator, state.pooled[int(state.clock[CLOCK_PLANE])], features)
+
+
+def write_features(scales, wide, operator, pooled, features):
+    parts = pooled.astype(np.int64).reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
+    if operator.scales is not None:
+        if operator.kind != SPLIT:
+            parts = parts[:, :1] - parts[:, 1:]
+        features[:] = (parts * operator.scales[: operator.n_filters]).reshape(-1)
+        return
     if operator.kind == SPLIT:
         signed, absolute = parts[:, 0], parts[:, 1]
         parts = np.stack([(absolute + signed) / 2, (absolute - signed) / 2], axis=1)
     features[:] = parts.reshape(-1) / operator.unit
+
+
+# streamfeat.kernels.narrow
+
+
+def narrow_gain(moments, operator):
+    fraction, exponent = math.frexp(operator.gain / deviation(moments, len(operator.columns), operator.eps))
+    factor, shift = math.floor(fraction * 2**15), exponent + 1
+    if shift < 0:
+        factor, shift = math.floor(factor / 2 ** min(-shift, 15)), 0
+    return min(shift, 15) + 2**16 * factor
+
+
+def _narrow_parts(packed, projection, upper, lower):
+    factor, shift = divmod(packed % 2**32, 2**16)
+    shifted = projection.astype(np.int64) * 2**shift
+    assert (np.abs(shifted) < 2**15).all()  # or the kernel would see another number
+    level = np.floor_divide(shifted * factor, 2**16) + 2**15
+    return np.maximum(level - upper, 0), np.maximum(lower.astype(np.int64) - level, 0)
+
+
+def narrow_code(packed, projection, upper, lower, code):
+    positive, negative = _narrow_parts(packed, projection, upper, lower)
+    code[:] = positive - negative
+
+
+def pool_narrow(sign, packed, projection, upper, lower, pooled):
+    pooled += sign * np.concatenate(_narrow_parts(packed, projection, upper, lower)).astype(np.int32)
+
+
+def move_rows(n, sign, queue, columns, projections, upper, lower, pooled):
+    width = len(upper)
+    for column, row, packed in queue[:n].tolist():
+        projection = projections[row : row + width]
+        pool_narrow(-1, packed % 2**32, projection, upper, lower, pooled)
+        projection += (-1 if sign < 0 else 1) * columns[column : column + width]
+        pool_narrow(1, packed // 2**32, projection, upper, lower, pooled)
+
+
+def move_queued(part, operator, state):
+    n, plane, cell_of_all, sign = state.queued[part].tolist()
+    columns = operator.columns if sign else state.sums[part]
+    sums = [state.pooled, *state.partial][part]
+    move_rows(
+        n,
+        sign,
+        state.queue[part],
+        columns.reshape(-1),
+        state.projections.reshape(-1),
+        operator.upper,
+        operator.lower,
+        sums[plane, cell_of_all],
+    )
+    state.queued[part, 0] = 0
+
+
+def queue_volume(plane, volume, n, part, operator, state):
+    change_volume(plane, volume, n, part, operator, state)
 
 
 # streamfeat.kernels.planes
@@ -676,6 +758,12 @@ def project_volume(plane, volume, ahead, start, most, part, operator, state):
     values[following:] = 0
     state.projections[plane, row], state.moments[plane, row] = sums_of(values, operator)
     return min(most, len(filled)), following
+
+
+def enter_atoms(wide, plane, row, part, operator, state):
+    if operator.inverse:
+        atoms = state.atoms[plane, row]
+        atoms[1] = operator.gram.astype(np.float64) @ atoms[0]
 
 
 def enter_code(plane, volume, part, operator, state):
@@ -854,8 +942,13 @@ def move_volume(plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
 
 
-def follow_changes(plane, volume, n, part, operator, state):
+def follow_changes(narrow, wide, plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
+
+
+def follow_rest(narrow, part, operator, state):
+    if narrow is not None:
+        move_queued(part, operator, state)
 
 
 def change_place(position, row, column, operator, state):

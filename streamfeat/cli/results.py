@@ -165,6 +165,8 @@ RESULTS: dict[str, dict[str, Field]] = {
         "coherence": Field("number", "largest likeness of two filters, 0 to 1", hidden=True),
         "unused": Field("int", "filters that no volume uses", quiet=True),
         "bytes": Field("int", "of the file"),
+        "state": Field("text", "`narrow`, engines keep sums of 16 bits, or `wide`, of 32"),
+        "wide_because": Field("text?", "why the state is not narrow", quiet=True),
         "log_determinant": Field(
             "text?", "with --rows free and fewer filters than entries: what it is taken of", hidden=True
         ),
