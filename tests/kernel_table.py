@@ -3,6 +3,7 @@
 The tests run every row against the twin of the same name in `naive`; benchmarks time the same rows.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -29,8 +30,10 @@ from streamfeat.kernels import (
     narrow,
     pixels,
     planes,
+    predict,
     spiking,
     surfaces,
+    trace,
     update,
     volume,
 )
@@ -52,6 +55,8 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
+from streamfeat.kernels.predict import PARTS, SUMMED, Weights
+from streamfeat.kernels.trace import Reading
 
 SCRATCH = {
     "touched",
@@ -75,15 +80,18 @@ SCRATCH = {
 
 def copied(value):
     """A copy of what a kernel may change; an operator is frozen and stays itself."""
-    if isinstance(value, State):
-        return State(*(field.copy() for field in value))
+    if isinstance(value, State | Reading):
+        return type(value)(*(field.copy() for field in value))
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def assert_same(kernel, twin, *, scratch=frozenset(), name="result"):
     if isinstance(kernel, Operator):
         return
-    if isinstance(kernel, State):
+    if isinstance(kernel, Reading | Weights):
+        for field in kernel._fields:
+            assert_same(getattr(kernel, field), getattr(twin, field), name=field)
+    elif isinstance(kernel, State):
         for field in State._fields:
             if field == "encoded":  # which part encodes a volume is nobody's business
                 assert kernel.encoded.sum() == twin.encoded.sum()
@@ -202,6 +210,30 @@ def exact_but_features(kernel: Run, twin: Run) -> None:
     assert_same(features, expected)
     for mine, yours in zip(kernel.after[at + 1 :], twin.after[at + 1 :], strict=True):
         assert_same(mine, yours)
+
+
+def exact_trace(kernel: Run, twin: Run) -> None:
+    """As `exact_but_features`; scores are those of the features, and what was read last is scratch."""
+
+    def without(run):
+        events, operator, state, _, _, features, _, accepted = run.after
+        return Run(run.before, (events, operator, state, features, accepted), None)
+
+    exact_but_features(without(kernel), without(twin))
+    _, operator, _, weights, reading, features, scores, _ = kernel.after
+    if not operator.inverse:
+        assert_same(scores, twin.after[6])
+    if len(features):
+        expected = np.zeros_like(scores)
+        naive.predict(features, weights, reading.roots.copy(), reading.sums.copy(), expected)
+        assert_same(scores, expected)
+
+
+def exact_but_roots(kernel: Run, twin: Run) -> None:
+    """All but the roots of the part that was summed last."""
+    for run in (kernel, twin):
+        run.after[-1].roots[:] = 0
+    exact(kernel, twin)
 
 
 def in_planes(state):
@@ -500,11 +532,11 @@ def make_mean_distance(rng):
     return rng.integers(0, 2**30, 33).astype(np.int32), int(rng.integers(1, 34))
 
 
-def make_start_of_bin(rng):
-    _, state = parts_of(random_engine(rng))
+def make_bin_length(rng):
+    operator, state = parts_of(random_engine(rng))
     if rng.random() < 0.3:
         state.clock[CLOCK_NOW] = BEFORE_TIME
-    return (state,)
+    return operator, state
 
 
 def make_slot_of(rng):
@@ -540,9 +572,37 @@ def make_libcaer_cmp(rng):
     return words, int(rng.integers(0, 2**50)), state, np.zeros(8 * len(words), EVENT_DTYPE)
 
 
+def random_sensor(rng):
+    return tuple(int(pick(rng, [1, 1000, 2**14, 2**15, 2**16])) for _ in range(2))
+
+
 def make_mono(rng):
     words = rng.integers(0, 2**64, random_length(rng, 80), np.uint64)
-    return words, int(rng.integers(0, 2**54)), int(rng.integers(0, 1000)), np.zeros(len(words), EVENT_DTYPE)
+    thousands = rng.random(len(words)) < 0.2
+    words[thousands] -= words[thousands] % np.uint64(2**32) % np.uint64(1000)
+    out, span = np.zeros(2 * len(words), np.int64), np.array([7, 7])
+    base_us, rest_ns = int(rng.integers(0, 2**54)), int(pick(rng, [0, 1, 999, rng.integers(0, 1000)]))
+    return words, base_us, rest_ns, *random_sensor(rng), out, span
+
+
+def make_libcaer(rng):
+    n = random_length(rng, 80)
+    us = np.sort(rng.integers(0, 2**31, n)).astype(np.uint64)
+    if rng.random() < 0.5:
+        us = (us + np.uint64(rng.integers(2**31))) % np.uint64(2**31)
+    us ^= (rng.random(n) < 0.1) * np.uint64(rng.choice([1, 2**31]))
+    words = us << np.uint64(32) | rng.integers(0, 2**32, n, np.uint64)
+    out, span = np.zeros(2 * n, np.int64), np.array([7, 7])
+    return words, int(rng.integers(0, 2**54)), *random_sensor(rng), out, span
+
+
+def make_place_events(rng):
+    events, height, width, span = make_time_span(rng)
+    events["t"] //= pick(rng, [1, 2**40])
+    events["t"][rng.random(len(events)) < 0.1] = pick(rng, [2**62, -(2**62), 2**62 - 1])
+    events["p"] = rng.choice([0, 1, 1, -1, 2], len(events))
+    reached_us = int(pick(rng, [-(2**62), 0, 2**20]))
+    return events, height, width, reached_us, np.zeros(len(events), np.int64), span
 
 
 def make_time_span(rng):
@@ -1231,10 +1291,96 @@ def make_follow_event(rng):
     return *(int(events[name][0]) for name in ("x", "y", "p", "t")), *sensor
 
 
+def random_weights(rng, n_features, classes):
+    length = SUMMED * math.ceil(math.ceil(n_features / PARTS) / SUMMED)
+    rows = rng.standard_normal((PARTS, classes, length)).astype(np.float32)
+    return Weights(rows, rng.standard_normal(classes).astype(np.float32))
+
+
+def reading_for(weights, n_features, cells):
+    """Scratch with anything in it."""
+    _, classes, length = weights.rows.shape
+    return Reading(
+        np.full(n_features, np.nan, np.float32),
+        np.full(length, np.nan, np.float32),
+        np.full((PARTS, classes + 1), np.nan, np.float32),
+        np.zeros(cells, np.uint8),
+        np.zeros(PARTS, np.uint8),
+    )
+
+
 def make_trace(rng):
-    events, *sensor, operator, state = make_follow(rng)
-    features, accepted = np.zeros((len(events), n_features(operator)), np.float32), np.zeros(len(events), int)
-    return events, *sensor, operator, state, features, accepted
+    events, operator, state = make_follow(rng)
+    n, classes = len(events), int(pick(rng, [0, 1, 1, 3]))
+    weights = random_weights(rng, n_features(operator), classes)
+    reading = reading_for(weights, n_features(operator), state.pooled.shape[1])
+    features = np.zeros((int(pick(rng, [0, n, n])), n_features(operator)), np.float32)
+    scores, accepted = np.zeros((n, classes), np.float32), np.zeros(n, int)
+    return events, operator, state, weights, reading, features, scores, accepted
+
+
+def make_read_stale(rng):
+    operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    weights = random_weights(rng, n_features(operator), int(pick(rng, [0, 1, 3])))
+    reading = reading_for(weights, n_features(operator), state.pooled.shape[1])
+    naive.read_features(operator, state, reading.features)
+    reading.sums[:] = rng.standard_normal(reading.sums.shape)
+    stale = rng.random(len(reading.is_stale)) < pick(rng, [0.0, 0.3, 1.0])
+    reading.features.reshape(len(stale), -1)[stale] = np.nan
+    reading.is_stale[:] = stale
+    reading.parts[:] = rng.random(PARTS) < pick(rng, [0.0, 0.0, 0.3])
+    return operator, state, weights, reading
+
+
+def make_mark_cells(rng):
+    operator, state = parts_of(random_engine(rng))
+    x, y = (int(rng.integers(len(ring))) for ring in (state.ring_columns, state.ring_rows))
+    return x, y, operator, state, (rng.random(state.pooled.shape[1]) < 0.1).astype(np.uint8)
+
+
+def random_features(rng, n, length):
+    features = np.abs(rng.standard_normal((n, length)) * 100).astype(np.float32)
+    features *= pick(rng, [np.float32(1), rng.choice([-1, 1], features.shape).astype(np.float32)])
+    features[rng.random(features.shape) < pick(rng, [0.2, 1.0])] = 0
+    return features
+
+
+def make_predict(rng):
+    n_features, classes, n = int(rng.integers(1, 1200)), int(pick(rng, [1, 3])), int(rng.integers(0, 4))
+    weights = random_weights(rng, n_features, classes)
+    reading = reading_for(weights, n_features, 1)
+    features = random_features(rng, n, n_features)
+    return features, weights, reading.roots, reading.sums, np.zeros((n, classes), np.float32)
+
+
+def make_sum_part(rng):
+    n_features, classes = int(rng.integers(1, 1200)), int(pick(rng, [0, 1, 3]))
+    weights = random_weights(rng, n_features, classes)
+    reading = reading_for(weights, n_features, 1)
+    features = random_features(rng, 1, n_features)[0]
+    return int(rng.integers(PARTS)), features, weights, reading.roots, reading.sums
+
+
+def make_score_parts(rng):
+    classes = int(pick(rng, [0, 1, 3]))
+    sums = rng.standard_normal((PARTS, classes + 1)).astype(np.float32)
+    sums[:, classes] = np.abs(sums[:, classes]) * pick(rng, [0, 1, 1])
+    return sums, rng.standard_normal(classes).astype(np.float32), np.zeros(classes, np.float32)
+
+
+def make_part_of(rng):
+    n_features = int(rng.integers(1, 1200))
+    return int(rng.integers(n_features)), n_features
+
+
+def make_read_cell(rng):
+    operator, state = parts_of(read_engine(rng))
+    return (
+        int(rng.integers(state.pooled.shape[1])),
+        operator,
+        state,
+        random_features(rng, 1, n_features(operator))[0],
+    )
 
 
 def make_read_features(rng):
@@ -1447,6 +1593,8 @@ KERNELS = [
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
     Row(decode.decode_mono, make_mono),
+    Row(decode.decode_libcaer, make_libcaer),
+    Row(decode.place_events, make_place_events),
     Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
     Row(file_codes.turns_between, make_turns_between),
@@ -1459,7 +1607,7 @@ KERNELS = [
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.is_valid, make_is_valid),
     Row(ingest.count_event, make_count_event),
-    Row(ingest.start_of_bin, make_start_of_bin),
+    Row(ingest.bin_length, make_bin_length),
     Row(ingest.slot_of, make_slot_of),
     Row(ingest.count_events, make_count_events, exact_below_the_top),
     Row(lasso.duality_gap, make_duality_gap, close),
@@ -1475,6 +1623,7 @@ KERNELS = [
     Row(lasso.solve_lasso_rows, make_solve_lasso_rows, rows_within_gap),
     Row(encode.encode_volume, make_encode_volume),
     Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
+    Row(encode.read_cell, make_read_cell),
     Row(encode.read_features, make_read_features),
     Row(encode.write_code, make_write_code),
     Row(encode.pool_row_of, make_pool_row_of, exact_but_scratch),
@@ -1508,7 +1657,13 @@ KERNELS = [
     Row(change.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
-    Row(follow.trace, make_trace, exact_but_features),
+    Row(predict.part_of, make_part_of),
+    Row(predict.sum_part, make_sum_part),
+    Row(predict.score_parts, make_score_parts),
+    Row(predict.predict, make_predict),
+    Row(trace.mark_cells, make_mark_cells),
+    Row(trace.read_stale, make_read_stale, exact_but_roots),
+    Row(trace.trace, make_trace, exact_trace),
     Row(pixels.draw_picture, make_draw_picture),
     Row(pixels.fire_pixels, make_fire_pixels),
     Row(spiking.spike_first, make_spike_first),

@@ -29,7 +29,17 @@ ROOMS = {
     "simulate": {"errors", "events", "files", "kernels"},
     "camera_files": {"errors", "events", "files", "kernels", "messages"},
     "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
-    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
+    "classify": {
+        "engine",
+        "errors",
+        "events",
+        "files",
+        "kernels",
+        "messages",
+        "recordings",
+        "report",
+        "work",
+    },
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
     "convert": {
         "camera_files",

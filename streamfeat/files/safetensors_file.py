@@ -21,13 +21,28 @@ __all__ = ["one_line", "read_safetensors", "write_safetensors"]
 
 
 def write_safetensors(
-    path: Path, kind: str, version: int, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+    path: Path,
+    kind: str,
+    version: int,
+    arrays: Mapping[str, NDArray[Any]],
+    header: Mapping[str, Any],
+    *,
+    private: bool = False,
 ) -> None:
-    """Write arrays and a JSON header as one file, which appears whole or not at all."""
+    """Write arrays and a JSON header as one file, which appears whole or not at all.
+
+    Args:
+        path: replaced if it exists.
+        kind: what it is.
+        versions: of its format, of which it must be one.
+        arrays: by name.
+        header: JSON values.
+        private: readable by this user alone.
+    """
     # safetensors writes the buffer of an array as it lies, so a transposed view would come back scrambled.
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     text = json.dumps({"format": kind, "version": version, **header})
-    write_atomically(path, save(contiguous, metadata={"streamfeat": text}))
+    write_atomically(path, save(contiguous, metadata={"streamfeat": text}), private=private)
 
 
 def one_line(error: BaseException) -> str:
@@ -44,7 +59,7 @@ def read_safetensors(
     Args:
         path: the file.
         kind: what it must be, or several kinds of which it must be one.
-        versions: of its format that are read.
+        versions: of its format, of which it must be one.
 
     Raises:
         InputError: the file cannot be read, or its header is not of this kind and one of these versions.

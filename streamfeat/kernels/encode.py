@@ -145,6 +145,21 @@ def pool_row_of(
 
 
 @kernel
+def read_cell(cell: int, operator: Operator, state: State, features: NDArray[np.float32]) -> None:
+    """Write the pooled sums of one cell of the current plane as floats, without padding.
+
+    Args:
+        cell: which.
+        operator: number of filters, encoding and fixed point.
+        state: not changed.
+        features: as for `read_features`; those of the cell are overwritten.
+    """
+    pooled, size = state.pooled[state.clock[CLOCK_PLANE]], features.shape[0] // state.pooled.shape[1]
+    own, place = pooled[cell : cell + 1], features[cell * size : (cell + 1) * size]
+    write_features(operator.steps, operator.wide, operator, own, place)
+
+
+@kernel
 def read_features(operator: Operator, state: State, features: NDArray[np.float32]) -> None:
     """Write the pooled sums of the current plane as floats, cell by cell and without padding.
 

@@ -1,11 +1,11 @@
 """Short vector code that a loop in Python cannot be made to compile to.
 
-Lives here: functions written in LLVM's own terms, each for a line or a block of int16 numbers.
+Lives here: functions written in LLVM's own terms, each for a line or a block of numbers.
 Not here: what the numbers mean (`volume`).
 
 The code names no processor. LLVM finds the instruction: products of pairs and their sum are `vpdpwssd` with
 AVX-512 VNNI, `vpmaddwd` with AVX2, `pmaddwd` with SSE2, and plain multiplications elsewhere. All of them
-are exact, so the bits are the same everywhere.
+are exact, so the bits are the same everywhere. Floats are summed in an order that is written down.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ from streamfeat.kernels.assembly import (
 )
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_listed"]
+__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_listed", "sum_products"]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
@@ -189,3 +189,43 @@ def _sum_pairs(builder: Any, n: Any, arrays: list[Any], width: Any, first: Any, 
             builder.store(
                 builder.shuffle_vector(low, high, straight), place(builder, sums, at, half)
             ).align = 4
+
+
+_FLOATS = 16
+"""Floats in one vector of `sum_products`; two of them are summed side by side."""
+
+
+@generated
+def sum_products(typing: Any, one: Any, start: Any, other: Any, begin: Any, n: Any) -> Any:
+    """Sum of `one[start + i] * other[begin + i]` over `n` float32 numbers, a multiple of 32; in this order.
+
+    Lane `j` of 32 sums products `j`, `j + 32`, and so on, each product and each sum rounded. Then the upper
+    half of the lanes is added to the lower one, until one is left.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds, lanes = signature.args, ir.VectorType(ir.FloatType(), _FLOATS)
+        arrays = [context.make_array(kinds[i])(context, builder, arguments[i]) for i in (0, 2)]
+
+        def add(index: Any, totals: list[Any]) -> list[Any]:
+            at = builder.mul(index, int64(2 * _FLOATS))
+            following = []
+            for half, total in enumerate(totals):
+                offset = builder.add(at, int64(half * _FLOATS))
+                factors = [
+                    load(builder, array, builder.add(arguments[first], offset), lanes, align=4)
+                    for array, first in zip(arrays, (1, 3), strict=True)
+                ]
+                following.append(builder.fadd(total, builder.fmul(*factors)))
+            return following
+
+        turns = builder.sdiv(arguments[4], int64(2 * _FLOATS))
+        left = builder.fadd(*repeat(builder, turns, [ir.Constant(lanes, None)] * 2, add))
+        width = _FLOATS
+        while width > 1:
+            width //= 2
+            halves = [order(list(range(at, at + width))) for at in (0, width)]
+            left = builder.fadd(*(builder.shuffle_vector(left, left, half) for half in halves))
+        return builder.extract_element(left, ir.Constant(I32, 0))
+
+    return types.float32(one, types.int64, other, types.int64, types.int64), generate
