@@ -1,6 +1,6 @@
 """Short vector code that a loop in Python cannot be made to compile to.
 
-Lives here: four functions written in LLVM's own terms, each for a line or a block of int16 numbers.
+Lives here: functions written in LLVM's own terms, each for a line or a block of int16 numbers.
 Not here: what the numbers mean (`volume`).
 
 The code names no processor. LLVM finds the instruction: products of pairs and their sum are `vpdpwssd` with
@@ -16,7 +16,7 @@ from numba.core import cgutils
 
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_pairs"]
+__all__ = ["copy_eight", "filled_mask", "lowest_bit", "multiply_tile", "prefetch", "sum_pairs"]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
@@ -133,6 +133,78 @@ def sum_pairs(typing: Any, pairs: Any, entries: Any, changes: Any, columns: Any,
         return context.get_dummy_value()
 
     return types.void(types.int64, entries, changes, columns, sums), generate
+
+
+TILE = 6
+"""Volumes that `multiply_tile` works on at once: their sums and a pair of columns fit into 32 registers."""
+
+
+@generated
+def multiply_tile(
+    typing: Any, n: Any, first: Any, windows: Any, rows: Any, packed: Any, filter: Any, projections: Any
+) -> Any:
+    """Projections of six volumes on 32 filters, from all of their entries.
+
+    `projections[rows[v], filter + k] = sum over i of windows[v, i] * columns[i, filter + k]` for `v` from
+    `first` on; beyond `n` it is the last volume again. `packed` holds the columns of these filters in pairs,
+    `(pairs, 64)`: of each filter both numbers side by side.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds = signature.args
+        windows, rows, packed, projections = (
+            context.make_array(kinds[i])(context, builder, arguments[i]) for i in (2, 3, 4, 6)
+        )
+        n, first, place = arguments[0], arguments[1], arguments[5]
+        last, volumes = builder.sub(n, _int64(1)), []
+        for i in range(TILE):
+            volume = builder.add(first, _int64(i))
+            volumes.append(builder.select(builder.icmp_signed("<", volume, last), volume, last))
+        length = builder.extract_value(windows.shape, 1)
+        starts = [builder.mul(volume, length) for volume in volumes]
+        totals = _multiply(builder, builder.extract_value(packed.shape, 0), windows, starts, packed)
+        width = builder.extract_value(projections.shape, 1)
+        narrow = kinds[6].dtype == types.int16
+        for volume, sums in zip(volumes, totals, strict=True):
+            row = builder.zext(builder.load(builder.gep(rows.data, [volume])), _I64)
+            at = builder.add(builder.mul(row, width), place)
+            for half, total in enumerate(sums):
+                to = builder.add(at, _int64(half * _HALF))
+                stored = builder.trunc(total, ir.VectorType(_I16, _HALF)) if narrow else total
+                builder.store(stored, _place(builder, projections, to, stored.type)).align = 2
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, windows, rows, packed, types.int64, projections), generate
+
+
+def _multiply(builder: Any, pairs: Any, windows: Any, starts: list[Any], packed: Any) -> list[list[Any]]:
+    """The loop over pairs of entries: two vectors of sums for each volume, in registers throughout."""
+    both, half = ir.VectorType(_I16, BLOCK), ir.VectorType(_I32, _HALF)
+    before = builder.block
+    head, body, done = (builder.append_basic_block(name) for name in ("entries", "entry", "multiplied"))
+    builder.branch(head)
+    builder.position_at_end(head)
+    index = builder.phi(_I64)
+    totals = [[builder.phi(half) for _ in range(2)] for _ in starts]
+    index.add_incoming(_int64(0), before)
+    for sums in totals:
+        for total in sums:
+            total.add_incoming(ir.Constant(half, None), before)
+    builder.cbranch(builder.icmp_unsigned("<", index, pairs), body, done)
+
+    builder.position_at_end(body)
+    at = builder.mul(index, _int64(2 * BLOCK))
+    columns = [_load(builder, packed, builder.add(at, _int64(i * BLOCK)), both) for i in range(2)]
+    item = builder.shl(index, _int64(1))
+    for start, sums in zip(starts, totals, strict=True):
+        factors = _load(builder, windows, builder.add(start, item), ir.VectorType(_I16, 2))
+        factors = builder.shuffle_vector(factors, factors, _order([0, 1] * _HALF))
+        for total, column in zip(sums, columns, strict=True):
+            total.add_incoming(builder.add(total, _product_of_pairs(builder, column, factors)), body)
+    index.add_incoming(builder.add(index, _int64(1)), body)
+    builder.branch(head)
+    builder.position_at_end(done)
+    return totals
 
 
 _HALF = BLOCK // 2
