@@ -7,8 +7,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from streamfeat.classify.classifier import Classifier, OnlineClassifier
+    from streamfeat.classify.classifier import Classifier
     from streamfeat.classify.features import EventFeatures
+    from streamfeat.classify.online import OnlineClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.engine.engine import Engine
     from streamfeat.engine.geometry import Geometry
@@ -67,7 +68,7 @@ _HOMES = {
     "EventFeatures": "classify.features",
     "Geometry": "engine.geometry",
     "InputError": "errors",
-    "OnlineClassifier": "classify.classifier",
+    "OnlineClassifier": "classify.online",
     "Pipeline": "stream.pipeline",
     "RecordingWriter": "recordings.writer",
     "Session": "stream.session",

@@ -5,7 +5,7 @@ with status 2.
 Not here: errors that only a bug can cause; those keep their traceback.
 """
 
-__all__ = ["InputError", "printable"]
+__all__ = ["InputError", "printable", "printable_lines"]
 
 _LONGEST = 1_000
 
@@ -27,6 +27,12 @@ def printable(text: str) -> str:
     cannot be shown escaped.
     """
     if not text.isprintable():
-        spaced = (" " if c.isspace() else c for c in text[:_LONGEST])
-        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in spaced)
+        text = printable_lines("".join(" " if c.isspace() else c for c in text[:_LONGEST]))
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+
+
+def printable_lines(text: str) -> str:
+    """Text of any length that does nothing to a terminal but to begin new lines."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)

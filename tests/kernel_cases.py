@@ -914,6 +914,65 @@ GATHER_VOLUME = {
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
 
+# Pixels of a simulated camera.
+
+
+FIRE_PIXELS = {
+    "nothing fires": lambda call: call.result[1] == 0 and call.result[0] == len(call.before),
+    "some fire": lambda call: call.result[1] > 0,
+    "there is no room for one": lambda call: call.result[0] < len(call.before),
+    "there is no room after some": lambda call: call.result[1] > 0 and call.result[0] < len(call.before),
+    "a reset that ends between the frames": lambda call: (
+        (call.release > call.start) & (call.release < call.end)
+    ).any(),
+    "a reset that ends with the frame": lambda call: (call.release == call.end).any(),
+    "a reset that goes on": lambda call: (call.release > call.end).any(),
+    "light that stays": lambda call: (call.before == call.after).any(),
+    "light that rises and light that falls": lambda call: (
+        (call.before < call.after).any() and (call.before > call.after).any()
+    ),
+    "more events than pixels": lambda call: call.result[1] > len(call.before),
+    "not from the first pixel on": lambda call: call.pixel > 0,
+}
+
+# Spiking neurons. The calls' counts are those of before: the events decide.
+
+
+def _reaches(call, holds):
+    radius = call.weights.shape[0] // 2
+    return any(holds(x - radius, x + radius, call.potential.shape[2]) for x in call.x.tolist())
+
+
+SPIKING = {
+    "no event": lambda call: len(call.t) == 0,
+    "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
+    "a filter of one pixel": lambda call: call.weights.shape[0] == 1 and len(call.t) > 0,
+    "neurons beyond the sensor": lambda call: _reaches(call, lambda first, last, width: last >= width),
+    "neurons before it": lambda call: _reaches(call, lambda first, last, width: first < 0),
+    "a neuron that spikes at once": lambda call: (
+        len(call.t) > 0 and call.weights.max() > call.threshold
+        if hasattr(call, "threshold")
+        else len(call.t) > 0 and call.weights.max() > call.limits[0]
+    ),
+}
+FIRST = {
+    "without a leak": lambda call: call.limits[1] == 0 and len(call.t) > 0,
+    "potentials of both signs that leak": lambda call: (
+        call.limits[1] > 0 and (call.potential > 0).any() and (call.potential < 0).any() and len(call.t) > 0
+    ),
+    "no refractory time of S1": lambda call: call.limits[2] == 0 and len(call.t) > 1,
+    "no refractory time of C1": lambda call: call.limits[3] == 0 and len(call.t) > 1,
+    "a second event in the refractory time": lambda call: (
+        call.limits[2] > 0 and len(call.t) > 1 and np.diff(call.t).min() <= call.limits[2]
+    ),
+}
+LEAKY = {
+    "no refractory time": lambda call: call.dead == 0 and len(call.t) > 1,
+    "a second event in the refractory time": lambda call: (
+        call.dead > 0 and len(call.t) > 1 and np.diff(call.t).min() < call.dead
+    ),
+}
+
 # Time surfaces.
 
 
@@ -1074,6 +1133,9 @@ CASES = {
     "renew": RENEW,
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
+    "fire_pixels": FIRE_PIXELS,
+    "spike_first": SPIKING | FIRST,
+    "spike_leaky": SPIKING | LEAKY,
     "add_memory_surfaces": MEMORY_SURFACES,
     "time_surfaces": TIME_SURFACES,
 }

@@ -27,7 +27,9 @@ from streamfeat.kernels import (
     follow,
     ingest,
     lasso,
+    pixels,
     planes,
+    spiking,
     surfaces,
     update,
     volume,
@@ -1200,6 +1202,27 @@ def _surface_events(rng, height, width, n):
     return x, y, rng.integers(0, 2, n), t
 
 
+def make_draw_picture(rng):
+    tall, wide, height, width = rng.integers(1, 9, 4)
+    lines = rng.integers(0, tall, (height, 4)), rng.integers(0, wide, (width, 4))
+    weights = rng.random((height, 4)), rng.random((width, 4))
+    out = np.empty((height, width))
+    return rng.random((tall, wide)), lines[0], weights[0], lines[1], weights[1], np.empty(wide), out
+
+
+def make_fire_pixels(rng):
+    n, room = int(rng.integers(1, 30)), int(rng.choice([0, 2, 9, 400]))
+    before, steps = rng.integers(-9, 9, n) / 8, rng.choice([0, -1, 1, 3, -4, 9], n) / 8
+    start = float(rng.integers(0, 10_000))
+    end = start + float(rng.choice([1, 50, 4_000]))
+    thresholds = rng.integers(1, 4, (2, n)) / 16
+    release = start + rng.choice([-5.0, 0.0, 0.5, end - start, 9_000.0], n)
+    state = before + rng.integers(-1, 2, n) / 32, release
+    outs = (np.zeros(room, np.int64) for _ in range(3))
+    refractory = float(rng.choice([0, 1, 30, 1_000]))
+    return before, before + steps, start, end, thresholds, refractory, *state, int(rng.integers(0, n)), *outs
+
+
 def make_add_memory_surfaces(rng):
     height, width, cell = rng.integers(3, 12, 3)
     radius = int(rng.integers(0, 4))
@@ -1214,6 +1237,35 @@ def make_time_surfaces(rng):
     events = _surface_events(rng, height, width, random_length(rng, 60))
     latest = np.full((2, height + side - 1, width + side - 1), -np.inf)
     return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
+
+
+def _neurons(rng):
+    """Events, and the shapes of neurons and of cells of a few pixels."""
+    height, width, cell, n_orientations = (int(rng.integers(1, most)) for most in (9, 9, 5, 5))
+    x, y, p, t = _surface_events(rng, height, width, random_length(rng, 60))
+    cells = -(-height // cell), -(-width // cell), n_orientations
+    return (x, y, p, t), (2, height, width, n_orientations), cells, cell, 2 * int(rng.integers(0, 3)) + 1
+
+
+def make_spike_first(rng):
+    (x, y, p, t), neurons, cells, cell, side = _neurons(rng)
+    weights = rng.integers(-60, 100, (side, side, neurons[3])).astype(np.int32)
+    limits = np.array([rng.choice([60, 150]), rng.choice([0, 25]), *rng.choice([0, 5], 2), cell], np.int64)
+    potential = rng.integers(-80, 60, neurons).astype(np.int32)
+    updated, fired, pooled = (
+        np.full(shape, past)
+        for shape, past in ((neurons[:3], 0), (neurons[:3], BEFORE_TIME), (cells, BEFORE_TIME))
+    )
+    t = np.floor(t * 10).astype(np.int64)
+    return x, y, p, t, weights, limits, potential, updated, fired, pooled, np.zeros(cells, np.int64)
+
+
+def make_spike_leaky(rng):
+    events, neurons, cells, cell, side = _neurons(rng)
+    weights = rng.uniform(-60, 100, (side, side, neurons[3]))
+    numbers = float(rng.choice([60, 150])), float(rng.choice([0.0, 0.3])), cell
+    state = rng.uniform(-80, 60, neurons), np.zeros(neurons[:3]), np.full(neurons, -np.inf)
+    return *events, weights, *numbers, *state, np.zeros(cells, np.int64)
 
 
 def close_surfaces(kernel: Run, twin: Run) -> None:
@@ -1325,6 +1377,10 @@ KERNELS = [
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
     Row(follow.trace, make_trace, exact_but_features),
+    Row(pixels.draw_picture, make_draw_picture),
+    Row(pixels.fire_pixels, make_fire_pixels),
+    Row(spiking.spike_first, make_spike_first),
+    Row(spiking.spike_leaky, make_spike_leaky, close_surfaces),
     Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),
     Row(surfaces.time_surfaces, make_time_surfaces, close_surfaces),
     Row(volume.add_column, make_add_column),

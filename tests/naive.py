@@ -1032,6 +1032,106 @@ def _alone(left, places, t, support, latest, level):
     return noise
 
 
+# streamfeat.kernels.pixels
+
+
+def draw_picture(picture, rows, row_weights, columns, column_weights, scratch, out):
+    by_row = (row_weights[:, :, None] * picture[rows]).transpose(1, 0, 2)
+    by_row = (by_row[0] + by_row[1]) + (by_row[2] + by_row[3])
+    by_column = (by_row[:, columns] * column_weights).transpose(2, 0, 1)
+    out[:] = (by_column[0] + by_column[1]) + (by_column[2] + by_column[3])
+    scratch[:] = by_row[-1]
+
+
+def fire_pixels(
+    before,
+    after,
+    start,
+    end,
+    thresholds,
+    refractory,
+    reference,
+    release,
+    pixel,
+    out_pixel,
+    out_polarity,
+    out_t,
+):
+    # All pixels at once, as arrays: what it was before it was a kernel.
+    off, on = thresholds
+    live = np.arange(len(before)) >= pixel
+    slope = (after - before) / (end - start)
+    ends = live & (release > start) & (release <= end)
+    moved = np.where(ends, before + slope * (release - start), reference)
+    change = after - moved
+    fires = ((change >= on) | (change <= -off)) & live & (release <= end) & (slope != 0)
+    which = np.flatnonzero(fires)
+    slopes, rising = slope[which], slope[which] > 0
+    step = np.where(rising, on[which], -off[which])
+    first = np.clip(start + (moved[which] + step - before[which]) / slopes, start, end)
+    period = refractory + step / slopes
+    count = np.floor((end - first) / period).astype(np.int64) + 1
+    fits = np.cumsum(count) <= len(out_t)
+    n_fit = int(np.argmin(fits)) if not fits.all() else len(fits)
+    stop = int(which[n_fit]) if n_fit < len(which) else len(before)
+    seen = np.arange(len(before)) < stop + (n_fit < len(which))  # that pixel's reset ended as well
+    reference[:] = np.where(seen, moved, reference)
+    which, count, first, period, rising = (a[:n_fit] for a in (which, count, first, period, rising))
+    n = int(count.sum())
+    nth = np.arange(n) - np.repeat(np.cumsum(count) - count, count)
+    out_pixel[:n], out_polarity[:n] = np.repeat(which, count), np.repeat(rising, count)
+    out_t[:n] = (np.repeat(first, count) + nth * np.repeat(period, count)).astype(np.int64)
+    release[which] = first + (count - 1) * period + refractory
+    reference[which] = before[which] + slope[which] * (release[which] - start)
+    return stop, n
+
+
+# streamfeat.kernels.spiking
+
+
+def _receivers(x, y, weights, height, width):
+    """Pixels whose neurons an event reaches, each with its weights: those of the event as seen from there."""
+    radius = weights.shape[0] // 2
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            row, column = y - dy, x - dx
+            if 0 <= row < height and 0 <= column < width:
+                yield row, column, weights[dy + radius, dx + radius]
+
+
+def spike_first(x, y, p, t, weights, limits, potential, updated, fired, pooled, counts):
+    threshold, leak, dead, pooled_dead, cell = limits.tolist()
+    for xi, yi, pi, ti in zip(x.tolist(), y.tolist(), p.tolist(), t.tolist(), strict=True):
+        for row, column, weight in _receivers(xi, yi, weights, *potential.shape[1:3]):
+            if ti - fired[pi, row, column] <= dead:
+                continue
+            here = potential[pi, row, column].astype(int)
+            leaked = leak * (ti - updated[pi, row, column])
+            here = np.sign(here) * np.maximum(np.abs(here) - leaked, 0) + weight
+            updated[pi, row, column] = ti
+            spikes = np.flatnonzero(here > threshold)
+            for k in spikes:
+                at = row // cell, column // cell, k
+                if ti - pooled[at] > pooled_dead:
+                    pooled[at] = ti
+                    counts[at] += 1
+            if len(spikes):
+                fired[pi, row, column] = ti
+            potential[pi, row, column] = 0 if len(spikes) else here
+
+
+def spike_leaky(x, y, p, t, weights, threshold, dead, cell, potential, updated, fired, counts):
+    for xi, yi, pi, ti in zip(x.tolist(), y.tolist(), p.tolist(), t.tolist(), strict=True):
+        for row, column, weight in _receivers(xi, yi, weights, *potential.shape[1:3]):
+            here = potential[pi, row, column] * math.exp(updated[pi, row, column] - ti)
+            updated[pi, row, column] = ti
+            here = here + np.where(ti - fired[pi, row, column] >= dead, weight, 0.0)
+            spikes = here >= threshold
+            fired[pi, row, column, spikes] = ti
+            counts[row // cell, column // cell] += spikes
+            potential[pi, row, column] = np.where(spikes, 0.0, here)
+
+
 # streamfeat.kernels.surfaces
 
 

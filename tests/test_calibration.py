@@ -16,8 +16,9 @@ from streamfeat.classify.calibration import (
     fitted_temperature,
     probabilities,
 )
-from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.kernel import load_classifier, train_kernel_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
 

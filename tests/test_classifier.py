@@ -16,14 +16,10 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import LinearSVC
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
+from streamfeat.classify import online as online_module
 from streamfeat.classify import svm as svm_module
-from streamfeat.classify.classifier import (
-    Classifier,
-    OnlineClassifier,
-    _climb,
-    normalise_features,
-    train_classifier,
-)
+from streamfeat.classify.classifier import Classifier, _climb, normalise_features, train_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.classify.svm import LinearSVM
 from streamfeat.errors import InputError
 
@@ -430,6 +426,49 @@ def test_learning_goes_on_from_a_trained_classifier(tmp_path, n_classes):
     learner.flush()
     assert learner.classifier.centre is trained.centre
     assert not np.array_equal(learner.classifier.weights, trained.weights)
+
+
+def test_what_all_features_have_in_common_does_not_hinder_learning_from_nothing():
+    """Features of events are positive, and more alike than not."""
+    rng = np.random.default_rng(3)
+    labels = rng.choice(["a", "b"], 600).tolist()
+    rows = (3 + rng.random((600, N))).astype(np.float32)
+    rows[:, :4] += np.where(np.array(labels) == "a", 1.0, 0)[:, np.newaxis]
+    learner = OnlineClassifier(Classifier.untrained(labels, MODEL))
+    right = []
+    for row, label in zip(rows, labels, strict=True):
+        right.append(learner.predict_one(row) == label)
+        learner.learn_one(row, label)
+    plain = _perceptron_like(rows, labels)
+    assert np.mean(right[100:]) > np.mean(plain[100:]) + 0.3
+
+
+def _perceptron_like(rows, labels):
+    """Right or wrong, of passive-aggressive steps without a centre and without rehearsal."""
+    from sklearn.linear_model import SGDClassifier
+
+    model = SGDClassifier(loss="hinge", penalty=None, learning_rate="pa1", eta0=0.01, random_state=0)
+    prepared = Classifier.untrained(labels, MODEL).prepare(rows).astype(np.float64)
+    right = []
+    for start in range(0, len(labels), 16):
+        batch = slice(start, start + 16)
+        known = model.predict(prepared[batch]) if start else ["a"] * 16
+        right += [a == b for a, b in zip(known, labels[batch], strict=False)]
+        model.partial_fit(prepared[batch], labels[batch], classes=["a", "b"])
+    return right
+
+
+def test_what_is_kept_to_be_learned_again_is_bounded_and_fair(monkeypatch):
+    monkeypatch.setattr(online_module, "_MOST_KEPT", 50)
+    features, labels = toy_features(1000, 2)
+    learner = OnlineClassifier(Classifier.untrained(labels, MODEL), batch_size=10)
+    features[:, -1] = np.arange(1000)
+    for row, label in zip(features, labels, strict=True):
+        learner.learn_one(row, label)
+    assert len(learner._kept) == 50
+    # Earlier and later halves are equally likely: 25 of either, give or take three standard deviations.
+    size = np.array([row[-1] for row, _ in learner._kept])
+    assert 12 <= (size < np.median(learner.classifier.prepare(features)[:, -1])).sum() <= 38
 
 
 def test_an_unknown_label_is_refused():

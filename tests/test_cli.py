@@ -336,10 +336,6 @@ def bad(home, tmp_path_factory):
     changed_model(home / "direct", bad / "new_model", version=2)
     changed_model(home / "direct", bad / "odd_model", arrays={"mean": np.zeros(7, np.float32)})
     (bad / "cut_model").write_bytes((home / "direct").read_bytes()[:-10])
-    tiny.write_items(
-        bad / "small.mcap",
-        [Label(0, 1000, "cat"), tiny.packet(tiny.steady(0, 1000, 50, resolution=(5, 5)), (5, 5))],
-    )
     tiny.write_items(bad / "unlabelled.mcap", [tiny.packet(tiny.steady(0, 90_000, 900))])
     tiny.write_items(bad / "partly_labelled.mcap", tiny.labelled_items(6, names=("cat", "", "dog")))
     tiny.write_items(bad / "one_class.mcap", tiny.labelled_items(4, names=("cat",)))
@@ -396,8 +392,6 @@ REFUSALS = {
     "existing recording": (["convert", "{bad}/data", "{bad}/existing"], "exists already"),
     "output in no folder": ([*REPLAY, "-o", "{bad}/no/out.mcap"], "there is no folder"),
     "output is a folder": ([*REPLAY, "-o", "{bad}/folder", "--overwrite"], "is a folder"),
-    "sensor too small": (["replay", "{bad}/small.mcap", "-m", "{home}/direct"], "5x5 pixels"),
-    "sensor too small to train": (["train", "{bad}/small.mcap", *TRAIN], "5x5 pixels"),
     "emit": ([*REPLAY, "--emit", "often"], "--emit 'often'"),
     "speed": ([*REPLAY, "--speed", "-1"], "--speed '-1'"),
     "split": ([*REPLAY, "--split", "moon"], "no samples of split 'moon'"),
@@ -499,6 +493,25 @@ def test_events_that_cannot_be_are_counted(run, home, tmp_path):
     path = tiny.write_items(tmp_path / "odd.mcap", items)
     said = run("replay", path, "-m", home / "direct", "--json").json
     assert (said["events"], said["rejected"], said["late"]) == (540, 2, 0)
+
+
+def test_a_resolution_that_changes_midway_is_told(run, tmp_path):
+    sizes = [(34, 34), (34, 34), (20, 40), (34, 34), (12, 16), (30, 31), (30, 32)]
+    parts = [
+        tiny.packet(tiny.steady(i * 10_000, (i + 1) * 10_000, 20, i, size), size)
+        for i, size in enumerate(sizes, 1)
+    ]
+    one, several = tmp_path / "one.mcap", tmp_path / "several.mcap"
+    tiny.write_items(one, parts[:2])
+    tiny.write_items(several, parts)
+    assert run("info", one, "--json").json["other_resolutions"] == []
+    assert "also" not in run("info", one).out
+    said = run("info", several, "--json").json
+    assert said["resolution"] == [34, 34]
+    assert said["other_resolutions"][0] == {"resolution": [20, 40], "packets": 1}
+    assert [other["resolution"] for other in said["other_resolutions"][1:]] == [[12, 16], [30, 31], [30, 32]]
+    table = run("info", several).out
+    assert "40x20 (1 packets), 16x12 (1 packets), 31x30 (1 packets) and 1 others" in table
 
 
 def test_a_damaged_chunk_costs_only_itself(run, home, tmp_path):

@@ -124,3 +124,26 @@ def test_a_tiny_model_is_refused_by_a_classifier_of_another(run, tmp_path):
 def test_a_long_name_above_a_short_table_is_not_broken_into_its_width(capsys):
     program.print_result({"labels": 0}, "a_recording_with_a_long_name.mcap", as_json=False)
     assert capsys.readouterr().out.splitlines()[0] == "a_recording_with_a_long_name.mcap"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["repaly"], "error: no such command 'repaly'. Did you mean 'replay'? (`streamfeat -h` says more)"),
+        (["replay"], "error: missing argument 'REC' (`streamfeat replay -h` says more)"),
+        (["replay", "x.mcap", "--emmit", "10ms"], "error: no such option: --emmit"),
+        (["learn", "x.mcap"], "error: missing option '--output' / '-o' (`streamfeat learn -h` says more)"),
+        (["replay", "x.mcap", "--speed"], "error: option '--speed' requires an argument"),
+    ],
+)
+def test_a_command_line_that_makes_no_sense_is_told_in_one_line(run, arguments, said):
+    told = run(*arguments)
+    assert (told.status, told.out) == (2, "")
+    assert told.err.startswith(said)
+    assert told.err.count("\n") == 1
+
+
+def test_without_a_command_there_is_help(run):
+    told = run()
+    assert "Commands:" in told.out + told.err
+    assert "error" not in told.err

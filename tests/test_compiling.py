@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import tiny
 
 import streamfeat
 from streamfeat.kernels import cache
@@ -112,3 +113,26 @@ def test_no_process_where_it_would_be_of_no_use(empty, monkeypatch, reason):
     with compiling.Compilers() as compilers:
         assert not compilers.is_alive()
         compilers.wait()
+
+
+@pytest.mark.parametrize("command", ["replay", "train", "latency", "evaluate"])
+def test_a_pipe_is_told_why_nothing_comes(run, tmp_path, monkeypatch, command):
+    """Once, where kernels are not compiled yet; not where they are, nor where the summary alone is wanted."""
+    recording = tiny.write_items(tmp_path / "rec.mcap", tiny.labelled_items(24))
+    model = tmp_path / "model"
+    tiny.encoder(k=3).save(model)
+    line = [command, recording, "-m", model, "--json"]
+    line += {
+        "train": ["-o", tmp_path / "c", "--overwrite", "--groups", "none"],
+        "evaluate": ["--folds", 2],
+    }.get(command, [])
+    line += {"latency": ["--warm-up", 1, "--limit-events", 9, "--seconds", 1]}.get(command, [])
+    monkeypatch.setattr(compiling, "_cores", lambda: 1)  # nothing is started
+    told = {}
+    for compiled in (True, False):
+        monkeypatch.setattr(compiling, "is_compiled", lambda compiled=compiled: compiled)
+        told[compiled] = run(*line)
+        assert told[compiled].status == 0, told[compiled].err
+    assert "compiling" not in told[True].err
+    assert told[False].err.count("compiling: kernels, once for this version") == 1
+    assert "compiling" not in run(*line, "--quiet").err

@@ -159,13 +159,27 @@ def test_an_origin_at_the_end_of_time_is_an_origin(origin_us):
     assert offline.any()
 
 
-def test_a_sensor_too_small_for_a_volume_is_refused():
-    case = known_case(resolution=(8, 6))
-    with pytest.raises(InputError, match="6x8 pixels is 3x4 after downsample 2, too small") as error:
-        case.engine()
-    assert one_line(error)
-    with pytest.raises(InputError, match="too small"):
-        case.encoder.encode(make_events([], [], [], []), (8, 6))
+@pytest.mark.parametrize("kind", [*EXACT_KINDS, *LASSO_KINDS], ids="-".join)
+@pytest.mark.parametrize("resolution", [(8, 6), (31, 6), (1, 1)])
+def test_what_a_small_sensor_lacks_of_a_volume_is_pixels_that_never_fire(kind, resolution):
+    small = known_case(kind, resolution=resolution)
+    side = GEOMETRY.patch * GEOMETRY.downsample
+    padded = known_case(kind, resolution=tuple(max(length, side) for length in resolution))
+    assert not GEOMETRY.has_room(resolution)
+    assert GEOMETRY.has_room(padded.resolution)
+    events = some_events(small, 400)
+    whole, bit_by_bit, larger = small.engine(), small.engine(), padded.engine()
+    whole.feed(events)
+    larger.feed(events[(events["x"] < resolution[1]) & (events["y"] < resolution[0])])
+    for event in events:
+        bit_by_bit.follow(event.reshape(1))
+    assert whole.features().any()
+    np.testing.assert_array_equal(whole.features(), larger.features())
+    if kind in EXACT_KINDS:
+        np.testing.assert_array_equal(whole.features(), bit_by_bit.features())
+        again = small.engine()
+        again.restore(whole.snapshot())
+        np.testing.assert_array_equal(again.features(), whole.features())
 
 
 # Stream time

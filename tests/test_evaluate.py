@@ -18,7 +18,8 @@ import tiny
 from typer.testing import CliRunner
 
 from streamfeat import cli
-from streamfeat.classify.classifier import Classifier, OnlineClassifier, train_classifier
+from streamfeat.classify.classifier import Classifier, train_classifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.errors import InputError
 from streamfeat.evaluate import cell as cell_module
 from streamfeat.evaluate import published, scores
@@ -26,6 +27,7 @@ from streamfeat.evaluate.methods import make_features
 from streamfeat.evaluate.page import tiled
 from streamfeat.evaluate.plan import METHODS, Cell, Trial, parse_sweep, plan_cells
 from streamfeat.evaluate.run import StateFile, evaluate, state_path
+from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes, gabor_filters
 from streamfeat.evaluate.splits import DataSet, Fold
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
@@ -216,7 +218,7 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear"}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear", "test_mirror": False}
     assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 
@@ -313,6 +315,47 @@ def test_a_histogram_of_surfaces_counts_each_event_in_its_quadrant():
     events = make_events([0, 7, 7, 0], [0, 0, 7, 7], [0, 1, 1, 0], [0, 1, 2, 3])
     counts = hots.encode(events, (8, 8)).reshape(2, 2, 2)
     assert counts.tolist() == [[[1, 0], [0, 1]], [[1, 0], [0, 1]]]
+
+
+def moving_bar(upright):
+    """A bar of 15 pixels that goes 12 pixels to the right, or down, one in a millisecond."""
+    along, across = (part.ravel() for part in np.meshgrid(np.arange(10, 25), np.arange(8, 20)))
+    x, y = (across, along) if upright else (along, across)
+    return make_events(x, y, np.ones(len(x)), (across - 8) * 1000)
+
+
+def test_gabor_filters_have_no_mean_and_one_length_and_turn():
+    filters = gabor_filters(7, 12)
+    np.testing.assert_allclose(filters.mean(axis=(0, 1)), 0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(filters, axis=(0, 1)), 100)
+    np.testing.assert_allclose(filters[:, :, 6], filters[:, :, 0].T, atol=1e-9)  # a quarter turn
+    np.testing.assert_allclose(filters[:, :, 2], filters[:, ::-1, 10], atol=1e-9)  # 30 degrees either way
+
+
+@pytest.mark.parametrize("network", [FirstSpikes(), LeakySpikes()], ids=["hfirst", "gabor-snn"])
+def test_spikes_tell_the_orientation_of_a_bar_and_where_it_was(network):
+    for upright in (False, True):
+        features = network.encode(moving_bar(upright), (32, 32), origin_us=0).reshape(8, 8, 12)
+        assert features.sum() > 10
+        spikes = features.sum(axis=(0, 1))
+        # 0 is along x and 6 along y, one of both by the filter's definition for bars.
+        assert spikes[0 if not upright else 6] > 5 * spikes[6 if not upright else 0]
+        assert not features[:1].any()
+        assert not features[:, :1].any()
+    assert network.n_features == features.size
+    assert not network.encode(moving_bar(True)[:0], (32, 32)).any()
+
+
+@pytest.mark.parametrize("network", [FirstSpikes(), LeakySpikes()], ids=["hfirst", "gabor-snn"])
+def test_spikes_do_not_depend_on_where_a_batch_ends(network):
+    events = tiny.steady(0, 50_000, 4_000, resolution=(20, 30))
+    columns = [events[name].astype(np.int64) for name in "xypt"]
+    whole, bit_by_bit = network.counter((20, 30)), network.counter((20, 30))
+    expected = whole(*columns).copy()
+    assert expected.sum() > 20
+    for cut in np.array_split(np.arange(len(events)), 37):
+        found = bit_by_bit(*(column[cut] for column in columns))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_surface_prototypes_are_the_same_from_the_same_seed(digits):
@@ -532,7 +575,7 @@ def test_the_state_of_another_run_is_refused(tmp_path):
 def test_an_interrupted_run_goes_on(animals, tmp_path):
     output = tmp_path / "result.json"
     arguments = ["evaluate", animals, *QUICK, "--early-samples", "0", "-o", output]
-    for method in ("counts", "direct", "inverse", "kmeans", "random", "hats", "hots"):
+    for method in ("counts", "direct", "inverse", "kmeans", "random", "hats", "hots", "hfirst", "gabor-snn"):
         arguments += ["--method", method]
     command = [sys.executable, "-c", "from streamfeat.cli import main; main()", *map(str, arguments)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, "NO_COLOR": "1"})
@@ -690,8 +733,8 @@ def test_filters_are_drawn_with_their_bins_side_by_side():
     filters[0, 0] = 2.0  # bin 0, first row, first column
     filters[8, -1] = -0.5  # bin 1, last row, last column
     picture = tiled(filters, (2, 2, 3))
-    tile = np.full((2, 7), 128)
-    tile[:, 3] = 255  # the gap between bins
+    tile = np.full((2, 7), 128.0)
+    tile[:, 3] = np.nan  # the gap between bins, the page behind it
     first, last = tile.copy(), tile.copy()
     first[0, 0], last[1, 6] = 255, 1
     np.testing.assert_array_equal(picture[:2, :7], first)

@@ -456,3 +456,20 @@ def test_an_event_from_before_a_wrap_may_come_after_it_and_in_the_next_block():
 def test_nothing_is_from_before_the_first_turn_of_a_clock():
     turn = 1 << 32
     assert Unwrapped(32)(np.array([5, turn - 5, 7])).tolist() == [5, turn - 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "remedy"),
+    [
+        ("old.dat", b"% Version 1\n% Width 304\n% Height 240\n\x00\x08" + bytes(16), "write it anew with"),
+        ("old.es", b"Event Stream\x01\x00\x00\x01" + bytes(16), "rewrite it with the program that made it"),
+        ("cut.h5", b"\x89HDF\r\n\x1a\n" + bytes(200), "copy it anew"),
+    ],
+)
+def test_what_cannot_be_read_says_what_to_do(tmp_path, name, content, remedy):
+    if name.endswith(".h5"):
+        pytest.importorskip("h5py")
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=remedy):
+        read_events(path)

@@ -26,7 +26,7 @@ ROOMS = {
     "shipped": {"engine"},
     "messages": {"errors", "events", "files", "kernels"},
     "denoise": {"errors", "events", "kernels", "messages"},
-    "simulate": {"events"},
+    "simulate": {"errors", "events", "files", "kernels"},
     "camera_files": {"errors", "events", "files", "kernels", "messages"},
     "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
     "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
@@ -40,6 +40,7 @@ ROOMS = {
         "files",
         "messages",
         "recordings",
+        "simulate",
         "work",
     },
     "stream": {
@@ -78,6 +79,8 @@ ONLY_IN = {
     "distributed": {"work"},
     "foxglove": {"view"},
     "websockets": {"view"},
+    "PIL": {"simulate"},
+    "av": {"simulate"},
     "numba": {"kernels", "latency", "cli"},
     "llvmlite": {"kernels", "cli"},
 }

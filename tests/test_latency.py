@@ -20,10 +20,13 @@ from streamfeat import cli
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
+from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
+from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
 from streamfeat.latency.end_to_end import measure_end_to_end, without_silence
 from streamfeat.latency.histogram import PERCENTILES, Latencies, RecentLatencies
 from streamfeat.latency.measure import LatencyReport
+from streamfeat.latency.others import TIMED, Method, any_prototypes, walk_method
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.text import spell
 from streamfeat.latency.update import call_each, feed_and_read, walk
@@ -342,8 +345,6 @@ def home(tmp_path_factory):
     for formulation in ("direct", "inverse"):
         tiny.encoder(formulation, "soft", k=3).save(home / f"{formulation}.safetensors")
     tiny.write_digits(home / "digits.mcap", 8, n_held_out=2)
-    small = [tiny.packet(tiny.steady(0, 90_000, 3000, resolution=(3, 3)), (3, 3))]
-    tiny.write_items(home / "small.mcap", small)
     tiny.write_items(home / "short.mcap", [tiny.packet(tiny.steady(0, 90_000, 300))])
     write_empty(home / "empty.mcap")
     (home / "mine.html").write_text("mine")
@@ -424,10 +425,54 @@ def test_one_split_without_look_ahead(run, home):
     assert said["rows"][0]["n"] == min(events, 3000)
 
 
+OTHERS = {
+    "hats": lambda columns, events, resolution: AveragedSurfaces(resolution).encode(events, resolution),
+    "hots": lambda columns, events, resolution: SurfaceHistogram(any_prototypes()).encode(events, resolution),
+    "hfirst": lambda columns, events, resolution: FirstSpikes().counter(resolution)(*columns).ravel(),
+    "gabor-snn": lambda columns, events, resolution: LeakySpikes().counter(resolution)(*columns).ravel(),
+    "counts": lambda columns, events, resolution: CountImage().encode(events, resolution),
+}
+
+
+@pytest.mark.parametrize("name", TIMED)
+def test_what_is_timed_of_a_method_is_what_its_features_are_made_of(name):
+    events, resolution = tiny.steady(0, 40_000, 4_000, resolution=(20, 30)), (20, 30)
+    live = TIMED[name][1](resolution)
+    columns = [events[field].astype(np.int64) for field in "xypt"]
+    columns[3] -= columns[3].min()
+    took = [live.timed([column[part] for column in columns]) for part in np.array_split(np.arange(4_000), 4)]
+    assert sum(map(len, took)) == 4_000
+    assert min(part.min() for part in took) > 0
+    expected = OTHERS[name](columns, events, resolution)
+    assert expected.any()
+    np.testing.assert_allclose(live.features(), expected, rtol=1e-6)
+
+
+def test_a_method_is_walked_sample_by_sample_and_warms_up():
+    items = [*tiny.labelled_items(2), Label(5_000_000, 90_000, "cat")]
+    asked = []
+    took = walk_method(Method("counts"), items, warm_up=100, goes=lambda done: asked.append(done) or True)
+    assert len(took) == n_events(items) - 100
+    assert asked[-1] == n_events(items)
+    with pytest.raises(InputError, match="choose from hats, hots"):
+        Method("dart")
+
+
+def test_updates_of_others_stand_beside_ours(run, home):
+    words = [home / "digits.mcap", "-m", home / "direct.safetensors", "--emit", "10ms", "--method", "counts"]
+    status, out, err = run(*words, *QUICK, "--json", "--method", "hfirst")
+    said = json.loads(out)
+    assert status == 0, err
+    rows = [(row["model"], row["emit"], row["what"]) for row in said["rows"]]
+    assert rows[-2:] == [("counts", "event", "update"), ("hfirst", "event", "update")]
+    assert [model["model"] for model in said["models"]] == ["direct", "counts", "hfirst"]
+    assert all(row["n"] > 0 and row["histogram"] for row in said["rows"][-2:])
+    assert "HFirst, layers S1 and C1" in run(*words, *QUICK, "--method", "hfirst")[1]
+
+
 REFUSALS = {
     "shorter than its warm-up": (["short.mcap"], "300 events are not more than the warm-up of 500"),
     "without events": (["empty.mcap"], "has no events"),
-    "model for another resolution": (["small.mcap"], "too small for one volume"),
     "unknown policy": (["digits.mcap", "--emit", "often"], "--emit 'often' is not understood"),
     "unknown suffix": (
         ["digits.mcap", "--plot", "{home}/out.pdf"],

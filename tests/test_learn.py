@@ -419,7 +419,9 @@ def test_presets():
     paper = Setting(**preset_with("paper", {"filters": 100, "bins": None}))
     assert (paper.filters, paper.bins, paper.encoding) == (100, 7, "triangle")
     assert all(changes.keys() <= DEFAULTS.keys() for changes in PRESETS.values())
-    with pytest.raises(InputError, match="there is no preset 'best'; choose from default, fast, paper"):
+    with pytest.raises(
+        InputError, match="there is no preset 'best'; choose from default, fast, accurate, paper"
+    ):
         preset_with("best", {})
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tiny
 
+from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.recordings.reader import open_recording
 from streamfeat.recordings.writer import RecordingWriter
@@ -305,11 +306,15 @@ def test_a_source_that_fails_ends_everything(tmp_path):
 
 
 @pytest.mark.real_time
-def test_a_failing_session_ends_everything():
+def test_a_failing_session_ends_everything(monkeypatch):
+    def fail(self, batch):
+        raise InputError("burnt out")
+
+    monkeypatch.setattr(Engine, "feed", fail)
+    monkeypatch.setattr(Engine, "follow", fail)
     sink = ListSink()
-    items = [tiny.packet(tiny.steady(0, 100, 10)), tiny.packet(tiny.stream([1], resolution=(3, 3)), (3, 3))]
-    with pytest.raises(InputError, match="too small"):
-        asyncio.run(Pipeline(items, session(), [sink]).run())
+    with pytest.raises(InputError, match="burnt out"):
+        asyncio.run(Pipeline([tiny.packet(tiny.steady(0, 100, 10))], session(), [sink]).run())
     assert sink.closed == "failed"
 
 

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 
 from streamfeat.events import EVENT_DTYPE
-from streamfeat.simulate.saccades import (
-    CameraModel,
-    Saccades,
-    digit_samples,
-    events_from_frames,
-    simulate_saccades,
-)
+from streamfeat.simulate.camera import CameraModel, events_from_frames
+from streamfeat.simulate.saccades import Saccades, digit_samples, simulate_saccades
 
 IDEAL = {"threshold_mismatch": 0.0, "noise_hz": 0.0}
 DOT = np.pad([[1.0]], 3)

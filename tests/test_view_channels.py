@@ -2,6 +2,7 @@
 
 import json
 import socket
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ pytest.importorskip("foxglove", reason="the extra `view` is not installed")
 
 from streamfeat.errors import InputError
 from streamfeat.view.channels import FileBoard, LiveBoard
+from streamfeat.view.gate import MAX_CLIENTS
 
 ABOUT = {"labels": "cat\ndog"}
 STATUS = {"t_s": 1.5, "frame": 1}
@@ -28,7 +30,7 @@ def board():
 @pytest.mark.real_time
 def test_a_client_gets_what_is_shown(board):
     board.announce("/view")
-    with Client(board.port) as client:
+    with Client(board.address) as client:
         client.subscribe("/status", "/events")
         until(lambda: _subscribed(board, "status", "events"))
         board.record("/view", "status", 1_500_000, STATUS)
@@ -50,7 +52,7 @@ def test_a_client_gets_what_is_shown(board):
 def test_who_comes_late_gets_what_was_shown_last(board):
     board.record("/view", "status", 1, {"frame": 1})
     board.record("/view", "status", 2, {"frame": 2})
-    with Client(board.port) as client:
+    with Client(board.address) as client:
         client.subscribe("/status")
         assert json.loads(client.message()[2]) == {"frame": 2}
 
@@ -61,7 +63,7 @@ def test_whoever_looks_is_noticed():
     board = LiveBoard(ABOUT, "test", 0, lambda: looked.append(1))
     try:
         board.announce("/view")
-        with Client(board.port) as client:
+        with Client(board.address) as client:
             assert not looked
             client.subscribe("/status")
             until(lambda: looked)
@@ -73,7 +75,7 @@ def test_whoever_looks_is_noticed():
 def test_a_client_that_does_not_read_loses_pictures_and_holds_up_nobody(board):
     board.announce("/view")
     picture = np.zeros((480, 640), np.uint8)
-    with Client(board.port, receive_buffer=4096) as slow, Client(board.port) as quick:
+    with Client(board.address, receive_buffer=4096) as slow, Client(board.address) as quick:
         for client in (slow, quick):
             client.subscribe("/events")
         until(lambda: _subscribed(board, "events"))
@@ -88,14 +90,83 @@ def test_a_client_that_does_not_read_loses_pictures_and_holds_up_nobody(board):
         assert times == sorted(times, key=lambda message: message[1])
 
 
+@pytest.mark.parametrize(
+    ("address", "host", "origin"),
+    [
+        ("/", None, None),
+        ("/?token=", None, None),
+        ("/?token=0123456789abcdef012345", None, "https://app.foxglove.dev"),
+        (None, "evil.example:{port}", None),
+        (None, None, "http://evil.example"),
+        (None, None, "null"),
+        (None, None, "https://app.foxglove.dev.evil.example"),
+        (None, "127.0.0.1", None),
+    ],
+)
+def test_foxglove_connects_with_the_printed_address_only(board, address, host, origin):
+    """Any page of a browser could read the pictures."""
+    where = f"ws://127.0.0.1:{board.port}{address}" if address else board.address
+    with pytest.raises(AssertionError, match="403"):
+        Client(where, host=host and host.format(port=board.port), origin=origin)
+
+
+@pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev", "file://"])
+def test_foxglove_is_let_in(board, origin):
+    board.record("/view", "status", 1, {"frame": 1})
+    with Client(board.address, origin=origin) as client:
+        client.subscribe("/status")
+        assert json.loads(client.message()[2]) == {"frame": 1}
+
+
+def test_a_page_of_ones_own_can_be_allowed():
+    board = LiveBoard(ABOUT, "test", 0, origins={"http://localhost:8080"})
+    try:
+        Client(board.address, origin="http://localhost:8080")._socket.close()
+        with pytest.raises(AssertionError, match="403"):
+            Client(board.address, origin="https://app.foxglove.dev")
+    finally:
+        board.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a system with one loopback address")
+def test_the_server_behind_the_gate_is_not_on_the_common_address(board):
+    with socket.socket() as one, pytest.raises(ConnectionRefusedError):
+        one.connect(("127.0.0.1", board._server.port))
+
+
+def test_no_more_than_sixteen_clients_and_their_places_come_back(board):
+    board.record("/view", "status", 1, {"frame": 1})
+    clients = [Client(board.address) for _ in range(MAX_CLIENTS)]
+    with pytest.raises(AssertionError, match="503"):
+        Client(board.address)
+    for client in clients:
+        client._socket.close()
+    until(lambda: board._guard._n_clients == 0)
+    with Client(board.address) as client:
+        client.subscribe("/status")
+        assert client.message()[0] == "/view/status"
+
+
+def test_clients_that_say_nothing_hold_up_nobody(board):
+    board.record("/view", "status", 1, {"frame": 1})
+    silent = [socket.create_connection(("127.0.0.1", board.port)) for _ in range(200)]
+    try:
+        with Client(board.address) as client:
+            client.subscribe("/status")
+            assert client.message()[0] == "/view/status"
+    finally:
+        for one in silent:
+            one.close()
+
+
 def test_a_client_that_goes_without_a_word_is_nobodys_error(board, capfd):
     board.announce("/view")
-    client = Client(board.port)
+    client = Client(board.address)
     client.subscribe("/events")
     client._socket.close()
     for i in range(50):
         board.picture("/view", "events", i, np.zeros((100, 100), np.uint8))
-    with Client(board.port) as other:
+    with Client(board.address) as other:
         other.subscribe("/events")
         assert other.message()[1] == 49_000
     assert capfd.readouterr() == ("", "")
@@ -114,7 +185,7 @@ def test_cameras_beyond_the_limit_replace_the_oldest(board, monkeypatch):
     monkeypatch.setattr("streamfeat.view.channels.MAX_CAMERAS", 2)
     for i in range(3):
         board.record(f"/cam{i}/view", "status", 0, {"frame": i})
-    with Client(board.port) as client:
+    with Client(board.address) as client:
         client.subscribe("/cam1/view/status", "/cam2/view/status")
         assert not any(channel["topic"].startswith("/cam0") for channel in client.channels.values())
 

@@ -149,14 +149,14 @@ def test_a_recording_begins_when_somebody_looks_and_its_end_stays(files):
     )
     with shown(view):
         until(lambda: any("waiting" in line for line in lines))
-        port = int(lines[0].rpartition(":")[2])
+        address = lines[0].removeprefix("Foxglove: ")
         assert view.result()["emissions"] == 0
-        with Client(port) as client:
+        with Client(address) as client:
             client.subscribe("/status")
             until(lambda: view.result()["samples"] == 6)
         emissions = view.result()["emissions"]
         assert emissions > 6
-        with Client(port) as late:
+        with Client(address) as late:
             late.subscribe("/bins", "/features")
             assert {late.message()[0], late.message()[0]} == {"/view/bins", "/view/features"}
     assert view.result()["emissions"] == emissions
@@ -201,7 +201,7 @@ def test_live_topics_are_shown_and_not_answered(files):
         until(lambda: lines)
         answers = []
         session.declare_subscriber("robot/cam/features", lambda sample: answers.append(1))
-        client = Client(int(lines[0].rpartition(":")[2]))
+        client = Client(lines[0].removeprefix("Foxglove: "))
         with plain_publisher(session, key) as camera, moving(camera), client:
             client.subscribe("/status", "/events")
             got = []
@@ -233,7 +233,7 @@ def test_a_ros_camera_is_shown(files):
     )
     with shown(view):
         until(lambda: lines)
-        with Client(int(lines[0].rpartition(":")[2])) as client:
+        with Client(lines[0].removeprefix("Foxglove: ")) as client:
             camera.run()
             sent = camera.result()
             until(lambda: view.result()["events"] == sent["events"])
@@ -343,10 +343,10 @@ def test_ctrl_c_ends_a_view(files, looking):
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
     try:
-        port = int(process.stderr.readline().rpartition(":")[2])
+        address = process.stderr.readline().strip().removeprefix("Foxglove: ")
         assert "waiting" in process.stderr.readline()
         if looking:
-            with Client(port) as client:
+            with Client(address) as client:
                 client.subscribe("/status")
                 client.message()
         process.send_signal(signal.SIGINT)

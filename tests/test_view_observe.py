@@ -88,6 +88,15 @@ def test_a_throttle_follows_its_clock_and_starts_anew_when_time_goes_back():
     assert [throttle.is_due(0) for now[0] in (0, 0.05, 0.1, 0.19, 0.25, 0.1, 0.15)] == [1, 0, 1, 0, 1, 1, 0]
 
 
+def test_a_throttle_keeps_its_rate_though_events_come_in_slices():
+    """A slice ends 0.03 s after the one before, so that a picture is never due when one ends."""
+    now = [0.0]
+    throttle = Throttle(10, clock=lambda: now[0])
+    assert sum(throttle.is_due(0) for now[0] in np.arange(0, 3, 0.03)) == 30
+    # After a pause pictures do not come in a hurry.
+    assert [throttle.is_due(0) for now[0] in (9, 9.03, 9.06, 9.12)] == [1, 0, 0, 1]
+
+
 def test_what_nobody_takes_is_replaced_and_counted():
     slot = Slot()
     engine, _ = watched()

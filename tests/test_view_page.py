@@ -300,6 +300,30 @@ def test_a_page_without_anything_to_show_says_so(tab):
 
 @pytest.mark.real_time
 @needs_chromium
+def test_a_thousand_classes_and_names_of_any_kind_are_drawn(tab):
+    """A newline in a class was the end of the page; so were a thousand classes."""
+    names = ["two\nlines", "<b>bold</b>", "\u202eright to left", *(f"class {i}" for i in range(997))]
+    server = PageServer(page, 0)
+    try:
+        tab.open(server.address)
+        server.record("", "about", 0, about(MODEL, names))
+        tab.until("model.about?.labels.length == 1000")
+        for i in range(200):
+            scores = [float((7 * i + j) % 1000 == 0) + (j == 0) for j in range(1000)]
+            record = {"t_s": i, "label": names[0], "scores": scores, "sample": None}
+            server.record("/view", "prediction", i, record)
+            tab.until(f"model.scores.at(-1)?.t == {i}")
+        tab.settle()
+        legend = tab.value("document.getElementById('legend').innerText")
+        assert {"two", "lines", "others"} <= set(legend.split())
+        assert tab.value("document.querySelectorAll('#legend b').length") <= 11
+        assert tab.problems == []
+    finally:
+        server.close()
+
+
+@pytest.mark.real_time
+@needs_chromium
 def test_cameras_can_be_chosen_and_missed_pictures_are_counted(tab):
     server = PageServer(page, 0)
     status = {"t_s": 0, "width": 16, "height": 12, "events": 5, "events_per_s": 0, "drops": {"late": 2}}
@@ -346,3 +370,81 @@ def test_each_cell_has_its_bars(tab, pooling):
         server.close()
     for cell, row in zip(cells, features.reshape(pooling**2, 2, -1), strict=True):
         assert cell == {"positive": row[0].tolist(), "negative": row[1].tolist()}
+
+
+WRITTEN = """
+window.written = [];
+const { fillText } = CanvasRenderingContext2D.prototype;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+  if (this.canvas.id === "latency") written.push(text);
+  return fillText.call(this, text, ...place);
+};
+0
+"""
+"""Notes what is written into the plot of latencies."""
+
+
+@needs_chromium
+def test_axes_count_time_as_the_head_does_and_nothing_lies_beside_an_empty_place(tab):
+    epoch_s = 1_744_227_144
+    status = {"width": 16, "height": 12, "events": 5, "events_per_s": 0, "drops": {}, "camera": "a"}
+    server = PageServer(page, 0)
+    server.record("", "about", 0, about(MODEL, ()))
+    try:
+        tab.open(server.address)
+        tab.until("typeof model == 'object' && open")
+        tab.value(WRITTEN)
+        for i in range(9):
+            t_s = epoch_s + i / 10
+            server.record("/a/view", "status", 0, status | {"t_s": t_s, "frame": i})
+            updates = {"median": 20, "max": 30, "n": 1}
+            engine = {"t_s": t_s, "active_volumes": 1, "volumes": 4, "update_us": updates}
+            server.record("/a/view", "engine", 0, engine)
+            tab.until(f"model.latency.length == {i + 1}")
+        tab.value("written.length = 0, dirty = true")
+        tab.settle()
+        written = set(tab.value("written"))
+        assert {"0.00", "0.20", "stream time (s)"} <= written, written
+        tab.value("at('time').click(), written.length = 0, dirty = true")
+        tab.settle()
+        written = set(tab.value("written"))
+        assert "camera time (s)" in written
+        assert any(text.startswith("17442271") for text in written), written
+        for width in (390, 800, 1400, 1920):
+            tab.resize(width, 900)
+            tab.settle()
+            assert tab.value("document.documentElement.scrollWidth <= innerWidth"), width
+            # Without a classifier the row of the features has no hole where scores would be.
+            boxes = "[...document.querySelectorAll('section')].map((s) => s.getBoundingClientRect())"
+            row = "document.querySelector('.features').getBoundingClientRect().top"
+            beside = f"Math.max(...{boxes}.filter((b) => Math.abs(b.top - {row}) < 2).map((b) => b.right))"
+            edge = "document.querySelector('main').getBoundingClientRect().right"
+            assert tab.value(beside) == pytest.approx(tab.value(edge), abs=1), width
+    finally:
+        server.close()
+
+
+@needs_chromium
+def test_a_long_name_of_a_class_leaves_its_key_in_sight(tab):
+    sheet = {"classes": ["wave", "a very long name of a class " * 3], "file": "l.csv", "saved": True}
+    label = {"at": 5, "start_s": 0.25, "end_s": 0.5, "label": "wave"}
+    server = PageServer(page, 0)
+    server.record("", "about", 0, about(None, ()))
+    server.record("/view", "player", 0, {"at_s": 0, "paused": True, "ended": False, "speed": 1})
+    server.record("/view", "labels", 0, sheet | {"labels": [label], "problem": "", "can_undo": False})
+    try:
+        tab.open(server.address)
+        tab.until("document.querySelectorAll('#classes button').length == 2")
+        for width in (390, 1400):
+            tab.resize(width, 900)
+            tab.settle()
+            ends = "(([a, b]) => [a, b].map((e) => e.getBoundingClientRect().right))"
+            button, key = tab.value(
+                f"{ends}([...document.querySelectorAll('#classes button, #classes kbd')].slice(2))"
+            )
+            assert key < button
+        tab.value("choose(0.3)")
+        tab.settle()
+        assert tab.value("at('label-hint').textContent").startswith("wave, 0.25 to 0.50 s: ")
+    finally:
+        server.close()

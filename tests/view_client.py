@@ -6,6 +6,7 @@ import os
 import socket
 import struct
 import time
+from urllib.parse import urlsplit
 
 from live_net import PATIENCE_S
 
@@ -15,7 +16,10 @@ _TEXT, _BINARY = 1, 2
 class Client:
     """Connects, subscribes to what it is told to, keeps what it is given."""
 
-    def __init__(self, port, receive_buffer=None):
+    def __init__(self, address, receive_buffer=None, host=None, origin=None):
+        """`address` is the one that is printed: `ws://127.0.0.1:PORT/?token=TOKEN`."""
+        at = urlsplit(address)
+        port = at.port
         self._socket = socket.socket()
         if receive_buffer:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
@@ -23,8 +27,9 @@ class Client:
         self._socket.connect(("127.0.0.1", port))
         key = base64.b64encode(os.urandom(16)).decode()
         lines = (
-            "GET / HTTP/1.1",
-            f"Host: 127.0.0.1:{port}",
+            f"GET {at.path}?{at.query} HTTP/1.1",
+            f"Host: {host or at.netloc}",
+            *([f"Origin: {origin}"] if origin else []),
             "Upgrade: websocket",
             "Connection: Upgrade",
             f"Sec-WebSocket-Key: {key}",
@@ -36,7 +41,9 @@ class Client:
         while b"\r\n\r\n" not in self._data:
             self._data += self._socket.recv(4096)
         head, _, self._data = self._data.partition(b"\r\n\r\n")
-        assert b" 101 " in head, head
+        if b" 101 " not in head:
+            self._socket.close()
+            raise AssertionError(head.decode())
         self.channels = {}
         self._subscriptions = {}
 

@@ -29,7 +29,8 @@ from streamfeat.events import Events
 from streamfeat.learn.from_files import learn_encoder
 from streamfeat.messages.packets import Label
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.simulate.saccades import CameraModel, Saccades, events_from_frames, simulate_saccades
+from streamfeat.simulate.camera import CameraModel, events_from_frames
+from streamfeat.simulate.saccades import Saccades, simulate_saccades
 
 FOLDER = Path(__file__).resolve().parent.parent / "streamfeat" / "shipped"
 MODEL, SUMS = "general.safetensors", "SHA256SUMS"

@@ -21,7 +21,8 @@ import numpy as np
 from streamfeat.events import Events
 from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.simulate.saccades import CameraModel, digit_samples
+from streamfeat.simulate.camera import CameraModel
+from streamfeat.simulate.saccades import digit_samples
 
 FOLDER = Path(__file__).resolve().parent.parent / "recordings"
 COUNTS = {"train": 250, "test": 100}

@@ -33,6 +33,7 @@ from streamfeat.camera_files.source import (
 )
 from streamfeat.errors import InputError
 from streamfeat.events import Events, make_events
+from streamfeat.files.budget import Budget
 
 __all__ = ["open_aedat4"]
 
@@ -125,11 +126,12 @@ def open_aedat4(path: Path, head: bytes, options: TableOptions) -> Contents:
 def _read_aedat4(path: Path, header: _Header, number: int, losses: Losses) -> Iterator[Events]:
     """Packets of one event stream; where one is damaged, those before it are kept."""
     n = 0
+    budget = Budget(path.stat().st_size)
     with path.open("rb") as raw:
         try:
             for stream, data in _packets(raw, header):
                 if stream == number:
-                    events = _events(_unpacked(data, header.compression))
+                    events = _events(_unpacked(data, header.compression, budget))
                     n += len(events)
                     yield events
         except _DAMAGE as error:
@@ -202,13 +204,14 @@ def _packets(raw: BinaryIO, header: _Header) -> Iterator[tuple[int, bytes]]:
         yield stream, data
 
 
-def _unpacked(data: bytes, compression: str) -> bytes:
+def _unpacked(data: bytes, compression: str, budget: Budget) -> bytes:
     if compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=_LARGEST_PACKET + 1)
     elif compression == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_PACKET + 1)
     if len(data) > _LARGEST_PACKET:
         raise ValueError(f"a packet of more than {_LARGEST_PACKET} bytes")
+    budget.take(len(data))
     return data
 
 

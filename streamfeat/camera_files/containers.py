@@ -107,7 +107,7 @@ def open_hdf5(path: Path, head: bytes, options: TableOptions) -> Contents:
     try:
         begun = stream.take()
     except _DamageError as error:
-        raise InputError(f"{path}: HDF5 file is cut short or damaged: {error}") from error
+        raise InputError(f"{path}: HDF5 file is cut short or damaged, copy it anew: {error}") from error
     about = begun.about
     said = list(about["assumptions"])
     layout: Layout | None = None

@@ -35,7 +35,10 @@ def open_event_stream(path: Path, head: bytes, options: TableOptions) -> Content
         )
     version, kind = head[12:15], head[15]
     if version[0] != 2:
-        raise InputError(f"{path}: Event Stream version {'.'.join(map(str, version))}; only 2 is read")
+        raise InputError(
+            f"{path}: Event Stream version {'.'.join(map(str, version))}; only 2 is read; "
+            "rewrite it with the program that made it"
+        )
     if kind not in (_DVS, _ATIS):
         named = _KINDS.get(kind, f"events of kind {kind}")
         raise InputError(f"{path}: holds {named}; only DVS and ATIS events are read")

@@ -29,6 +29,7 @@ import numpy as np
 from streamfeat.camera_files.columns import field_of, named_fields
 from streamfeat.camera_files.source import chosen_stream
 from streamfeat.errors import InputError
+from streamfeat.files.budget import Budget
 
 __all__ = ["ECF_FILTER", "FRAME", "ROWS", "serve"]
 
@@ -41,7 +42,6 @@ _MOST_OBJECTS, _DEEPEST = 2_000, 5  # that are looked at to find events
 _BLOCK_BYTES = 4 << 20
 _CHUNK_BYTES = 64 << 20  # a chunk is unpacked whole; Prophesee writes 16,384 events in each
 _ECF_BYTES = 12 + 65_535 * 9  # a chunk at its largest
-_SQUEEZE = 2048  # rows may take so many times their bytes in the file: deflate saves at most 1032
 _ROOM_BYTES = 1 << 30
 _OPEN_S, _BLOCK_S = 1.0, 5.0  # of the processor: a thousand times what they take
 
@@ -239,7 +239,7 @@ def _check(h5py: Any, root: Any, dataset: Any) -> None:
     stored = dataset.id.get_storage_size()
     row = dataset.dtype.itemsize
     chunk_bytes = math.prod(dataset.chunks) * row if dataset.chunks else 0
-    if dataset.nbytes > _SQUEEZE * stored or chunk_bytes > _CHUNK_BYTES:
+    if dataset.nbytes > Budget(stored).left or chunk_bytes > _CHUNK_BYTES:
         raise InputError(f"claims {len(dataset)} events in {stored} bytes, in chunks of {chunk_bytes}")
 
 

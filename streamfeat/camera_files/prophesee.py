@@ -139,7 +139,8 @@ def open_dat(path: Path, head: bytes, options: TableOptions) -> Contents:
     if len(kind) < 2 or kind[0] not in (0x00, 0x0C) or kind[1] != 8 or fields.get("version", "2") != "2":
         raise InputError(
             f"{path}: byte {contents.start}: event type and size {kind.hex(' ') or 'missing'}, version "
-            f"{fields.get('version', '2')}; only CD events (00 or 0c) of 8 bytes, version 2, are read"
+            f"{fields.get('version', '2')}; only CD events (00 or 0c) of 8 bytes, version 2, are read; "
+            "write it anew with the camera's software, or give a table of x, y, p, t"
         )
     return replace(contents, start=start, read=partial(_read_dat, path, start))
 

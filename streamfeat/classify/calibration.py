@@ -26,6 +26,8 @@ __all__ = [
     "calibration_error",
     "checked_by_folds",
     "checked_temperature",
+    "confidence_bins",
+    "error_of_bins",
     "fitted_temperature",
     "probabilities",
     "temperature_field",
@@ -125,7 +127,17 @@ def calibration_error(found: NDArray[np.floating], targets: NDArray[np.integer])
         found: `(n, C)` probabilities.
         targets: `(n,)` columns of the true labels.
     """
+    return error_of_bins(confidence_bins(found, targets))
+
+
+def confidence_bins(found: NDArray[np.floating], targets: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Of ten bins of confidence `(10, 3)`: samples, the sum of their confidence, and how many are right."""
     confidence, right = found.max(axis=1), found.argmax(axis=1) == targets
     bins = np.minimum((confidence * _BINS).astype(int), _BINS - 1)
-    off = np.abs(np.bincount(bins, confidence - right, _BINS))
-    return float(off.sum() / len(found))
+    columns = np.ones(len(bins)), confidence, right
+    return np.stack([np.bincount(bins, column, _BINS) for column in columns], axis=1)
+
+
+def error_of_bins(bins: NDArray[np.float64]) -> float:
+    """The expected calibration error of `confidence_bins`; those of several folds may be added up."""
+    return float(np.abs(bins[:, 1] - bins[:, 2]).sum() / max(bins[:, 0].sum(), 1))

@@ -1,7 +1,8 @@
-"""From features to labels: the frozen linear classifier, and the one that learns online.
+"""From features to labels: the frozen linear classifier.
 
-Lives here: normalising pooled features, training with cross-validation, saving, predicting, updating.
-Not here: features (`engine`, `encoder`), when to predict (`pipeline`), scores of accuracy (`evaluate`).
+Lives here: normalising pooled features, training with cross-validation, saving, predicting.
+Not here: features (`engine`, `encoder`), the one that goes on learning (`online`), when to predict
+(`pipeline`), scores of accuracy (`evaluate`).
 
 Predicting needs NumPy alone; scikit-learn is imported where something is learned, for that takes longer than
 all else before a first prediction.
@@ -27,7 +28,7 @@ from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
 from streamfeat.report.shown import Shown
 
-__all__ = ["Classifier", "OnlineClassifier", "normalise_features", "train_classifier"]
+__all__ = ["Classifier", "normalise_features", "train_classifier"]
 
 FORMAT_VERSION = 1
 
@@ -313,79 +314,6 @@ def _climb(score: Callable[[float], float], n: int) -> dict[float, float]:
         found[best - 1] = score(10.0 ** (best - 1))
         best = max(found, key=lambda p: (found[p], -p))
     return {10.0**power: value for power, value in found.items()}
-
-
-class OnlineClassifier:
-    """A linear classifier that goes on learning: passive-aggressive steps over scikit-learn's `partial_fit`.
-
-    One step for one sample costs milliseconds in scikit-learn, a batch hardly more: samples are collected
-    and learned `batch_size` at a time. Predictions come from the weights of the last batch.
-
-    Args:
-        start: where to begin; its normalisation stays as it is.
-        rate: largest step for one sample (PA-I's C, Crammer et al. 2006).
-        batch_size: samples to collect before a step.
-        seed: of scikit-learn's shuffling.
-    """
-
-    def __init__(self, start: Classifier, *, rate: float = 0.01, batch_size: int = 16, seed: int = 0) -> None:
-        """Start from the weights of `start`."""
-        from sklearn.linear_model import SGDClassifier
-
-        self.classifier = start
-        self.batch_size = batch_size
-        self.learned = 0
-        self._pending: list[tuple[NDArray[np.float32], int]] = []
-        self._model = SGDClassifier(
-            loss="hinge", penalty=None, learning_rate="pa1", eta0=rate, random_state=seed
-        )
-        # The first call only makes scikit-learn allocate; its weights are replaced at once.
-        classes = np.arange(len(start.labels))
-        self._model.partial_fit(np.zeros((len(classes), len(start.centre))), classes, classes=classes)
-        # Its loops take contiguous rows of float64 only.
-        self._model.coef_ = np.ascontiguousarray(start.weights.T, np.float64)
-        self._model.intercept_ = start.bias.astype(np.float64)
-
-    def predict_one(self, features: NDArray[np.float32]) -> str:
-        """The label for features `(F,)`, before anything is learned from them."""
-        return self.classifier.predict(features)
-
-    def learn_one(self, features: NDArray[np.float32], label: str) -> None:
-        """Take in one labelled sample.
-
-        Args:
-            features: `(F,)` float32; copied.
-            label: one of `classifier.labels`.
-
-        Raises:
-            InputError: the label is unknown.
-        """
-        if label not in self.classifier.labels:
-            known = ", ".join(self.classifier.labels)
-            raise InputError(f"label {label!r} is not one of the classifier's labels: {known}")
-        self._pending.append((self.classifier.prepare(features), self.classifier.labels.index(label)))
-        if len(self._pending) >= self.batch_size:
-            self.flush()
-
-    def flush(self) -> None:
-        """Learn what has been collected."""
-        if not self._pending:
-            return
-        rows, targets = zip(*self._pending, strict=True)
-        self._pending.clear()
-        self._model.partial_fit(np.stack(rows).astype(np.float64), np.array(targets))
-        self.learned += len(targets)
-        old = self.classifier
-        self.classifier = Classifier(
-            labels=old.labels,
-            centre=old.centre,
-            scale=old.scale,
-            weights=self._model.coef_.T.astype(np.float32),
-            bias=self._model.intercept_.astype(np.float32),
-            fingerprint=old.fingerprint,
-            provenance={**old.provenance, "learned_online": self.learned},
-            temperature=old.temperature,
-        )
 
 
 def _spread(scores: ArrayLike) -> NDArray[np.float32]:

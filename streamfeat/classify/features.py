@@ -97,6 +97,7 @@ def encode_recordings(
     report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
     *,
     variant: Variant = PLAIN,
+    held_out_too: bool = False,
     workers: Workers = THIS_PROCESS,
 ) -> EncodedSamples:
     """Encode all labelled samples of recordings, or a variant of those that are not held out.
@@ -105,7 +106,8 @@ def encode_recordings(
         encoder: the frozen encoder.
         recordings: open recordings.
         report: called with (step, done, of how many, remark).
-        variant: other than `PLAIN`, it is encoded of training samples only.
+        variant: other than `PLAIN`, it is encoded of training samples only, unless `held_out_too`.
+        held_out_too: encode the variant of samples of held-out splits as well.
         workers: read and encode.
     """
     labels: list[Label] = []
@@ -113,7 +115,7 @@ def encode_recordings(
     step = "encoding" if variant == PLAIN else f"encoding, {variant}"
     for recording in recordings:
         losses, parts = Losses(), [(recording.part(part),) for part in recording.parts()]
-        found = workers.map(_encode_part, parts, workers.hold(encoder), variant)
+        found = workers.map(_encode_part, parts, workers.hold(encoder), variant, held_out_too)
         for done, (names, encoded, lost) in enumerate(found, 1):
             labels += names
             rows.append(encoded)
@@ -129,12 +131,13 @@ def encode_recordings(
 
 
 def _encode_part(
-    opener: Callable[[], Recording], encoder: FeatureMap, variant: Variant
+    opener: Callable[[], Recording], encoder: FeatureMap, variant: Variant, held_out_too: bool
 ) -> tuple[list[Label], NDArray[np.float32], Losses]:
     with opener() as recording:
         samples = recording.samples()
         if variant != PLAIN:
-            samples = (variant.of(s) for s in samples if s.label.split not in HELD_OUT_SPLITS)
+            wanted = (s for s in samples if held_out_too or s.label.split not in HELD_OUT_SPLITS)
+            samples = (variant.of(s) for s in wanted)
         encoded = [*encode_samples(encoder, samples, threads=1)]
         rows = np.empty((len(encoded), encoder.n_features), np.float32)
         for row, (_, features) in zip(rows, encoded, strict=True):
@@ -226,19 +229,19 @@ class EventFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
         """Name each feature by its cell (row, column) and filter: `(n_features,)` str, such as `cell_0_1_17`.
 
-        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`.
+        With the encoding `split` a filter has two, `cell_0_1_17_pos` and `cell_0_1_17_neg`. Those of a second
+        scale begin with `scale_2_`, and so on.
 
         Args:
             input_features: samples have no features of their own, so it is ignored.
         """
-        halves = ("_pos", "_neg") if self.encoder.encoding == "split" else ("",)
-        cells = range(self.encoder.geometry.pooling)
         names = [
-            f"cell_{row}_{column}_{k}{half}"
-            for row in cells
-            for column in cells
-            for half in halves
-            for k in range(self.encoder.n_filters)
+            f"{f'scale_{number}_' if number > 1 else ''}cell_{row}_{column}_{k}{half}"
+            for number, scale in enumerate(self.encoder.scales, 1)
+            for row in range(scale.geometry.pooling)
+            for column in range(scale.geometry.pooling)
+            for half in (("_pos", "_neg") if scale.encoding == "split" else ("",))
+            for k in range(scale.n_filters)
         ]
         return np.array(names, object)
 

@@ -32,6 +32,12 @@ _KERNEL_VERSION = 1
 
 _DIMENSIONS = 256
 _RIDGE_WEIGHT = 1e-2
+_EXACT_AXES = 4096
+"""Rows, or features, up to which all principal axes are worked out."""
+
+_MORE_AXES, _ROUNDS = 32, 8
+"""Of the subspace iteration: axes beyond those that are kept, and how often the rows are gone through."""
+
 _FOR_MEDIAN = 2048
 """Rows whose distances the width of the kernel is told from."""
 
@@ -177,7 +183,7 @@ def train_kernel_classifier(
             probabilities.
 
     Raises:
-        InputError: there are more rows than the kernel matrix may have.
+        InputError: there are more rows than the kernel matrix may have, or memory for.
     """
     n = len(features)
     if n > MOST_POINTS:
@@ -186,6 +192,22 @@ def train_kernel_classifier(
             f"{8 * n * n / 2**30:.1f} GiB, at most {MOST_POINTS:,} rows are taken; give --kernel linear, or "
             "fewer samples or variants of them"
         )
+    try:
+        return _trained(features, linear, labels, parts)
+    except MemoryError:
+        raise InputError(
+            f"not enough memory for --kernel rbf with {n:,} training rows, which takes at least "
+            f"{8 * n * n / 2**30:.1f} GiB; give --kernel linear, or fewer samples or variants of them"
+        ) from None
+
+
+def _trained(
+    features: NDArray[np.float32],
+    linear: Classifier,
+    labels: NDArray[np.str_],
+    parts: NDArray[np.int64] | None,
+) -> KernelClassifier:
+    n = len(features)
     rows = normalise_features(features)
     mean = rows.mean(axis=0, dtype=np.float64).astype(np.float32)
     rows -= mean
@@ -227,6 +249,8 @@ def _principal_axes(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     from scipy.linalg import eigh
 
     n, width = rows.shape
+    if min(n, width) > _EXACT_AXES:
+        return _axes_by_iteration(rows)
     wide = rows.astype(np.float64)
     gram = wide @ wide.T if n < width else wide.T @ wide
     first = max(len(gram) - _DIMENSIONS, 0)
@@ -235,6 +259,19 @@ def _principal_axes(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     values, vectors = values[held], vectors[:, held]
     axes = wide.T @ (vectors / np.sqrt(values)) if n < width else vectors
     return np.ascontiguousarray(axes, np.float32)
+
+
+def _axes_by_iteration(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Nearly the same by subspace iteration (Halko, Martinsson and Tropp 2011, algorithm 4.4), seeded.
+
+    Eigenvectors of all of a covariance of 9,600 features would take minutes, and two gigabytes.
+    """
+    basis = np.random.default_rng(0).standard_normal((rows.shape[1], _DIMENSIONS + _MORE_AXES))
+    for _ in range(_ROUNDS):
+        basis = np.linalg.qr(rows.T @ (rows @ basis.astype(np.float32)))[0]
+    within = (rows @ basis.astype(np.float32)).astype(np.float64)
+    vectors = np.linalg.eigh(within.T @ within)[1][:, -_DIMENSIONS:]
+    return np.ascontiguousarray(basis @ vectors, np.float32)
 
 
 def _distances(points: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArray[np.float64]:

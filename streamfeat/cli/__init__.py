@@ -5,11 +5,16 @@ Not here: anything another program might want to call. Commands import what they
 `--help` does not wait for it.
 """
 
+import errno
+import os
 import signal
 import sys
+from contextlib import suppress
+from io import TextIOWrapper
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
+import typer
 from rich.markup import escape
 
 from streamfeat.cli import (
@@ -19,6 +24,7 @@ from streamfeat.cli import (
     live,
     measuring,
     recordings,
+    simulating,
     starting,
     streaming,
     viewing,
@@ -35,29 +41,81 @@ __all__ = [
     "main",
     "measuring",
     "recordings",
+    "simulating",
     "starting",
     "streaming",
     "viewing",
 ]
 
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""Of the library of Typer, which has it under no name of its own."""
+
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG}
+
 
 def main() -> NoReturn:
     """Run the command line; what the user can mend ends with one line and exit status 2.
 
-    SIGTERM ends a command as Ctrl-C does: with what is done written, and nothing half written.
+    SIGTERM ends a command as Ctrl-C does: with what is done written, and nothing half written. Where nobody
+    reads standard output any more, as behind `| head`, a command ends silently with 1.
     """
     signal.signal(signal.SIGTERM, _interrupt)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # where the encoding lacks a letter, its number is shown
+            stream.reconfigure(errors="backslashreplace")
     try:
-        app()
+        status = _run()
+        if sys.stdout:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _drop_output()
+        status = 1
+    except OSError as error:
+        if error.errno not in _NO_ROOM or error.filename is not None:
+            raise
+        _drop_output()
+        err.print(f"[bold red]error:[/] standard output cannot be written: {error.strerror}")
+        status = 2
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run a command; its exit status."""
+    try:
+        status = app(prog_name="streamfeat", standalone_mode=False)
+    except _UsageError as error:
+        _tell(error)
+        return 2
     except InputError as error:
         err.print(f"[bold red]error:[/] {escape(' '.join(str(error).split()))}", soft_wrap=True)
-        sys.exit(2)
+        return 2
     except MemoryError as error:
         err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
-        sys.exit(2)
+        return 2
     except KeyboardInterrupt:
-        sys.exit(130)
-    sys.exit(0)
+        return 130
+    return status if isinstance(status, int) else 0
+
+
+def _drop_output() -> None:
+    """Let what is still buffered go nowhere, so that the interpreter does not try to write it at its end."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _tell(error: Any) -> None:
+    """A command line that makes no sense: one line in place of three. Without a command it is the help."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return
+    said = error.format_message().rstrip(".")
+    line = said[:1].lower() + said[1:]
+    if error.ctx:
+        line += f" (`{error.ctx.command_path} -h` says more)"
+    err.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

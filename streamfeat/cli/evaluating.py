@@ -6,13 +6,11 @@ Not here: the evaluation (`streamfeat.evaluate`).
 
 import shlex
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from streamfeat.cli import options
 from streamfeat.cli.program import (
@@ -25,14 +23,16 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    compile_first,
     err,
     out,
     print_json,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
+from streamfeat.cli.tables import print_table
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
@@ -97,10 +97,21 @@ def evaluate(
     volumes: options.Volumes = None,
     iterations: options.Iterations = None,
     seed: options.Seed = None,
+    scales: options.Scales = None,
     mirror: options.Mirror = False,
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
+    select: Annotated[
+        int,
+        typer.Option(help="Learn so many times as many filters, and let labels choose those that are kept."),
+    ] = 1,
+    test_mirror: Annotated[
+        bool,
+        typer.Option(
+            "--test-mirror", help="Add the scores of the mirror image of each sample that is scored."
+        ),
+    ] = False,
     on: Annotated[
         str,
         typer.Option(
@@ -113,6 +124,10 @@ def evaluate(
     early_samples: Annotated[
         int, typer.Option(help="Held-out samples for early decision, at most; 0 leaves it out.")
     ] = 500,
+    against: Annotated[
+        Path | None,
+        typer.Option(help="An earlier result of the same samples, .json: differences to its first row."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result to write, as JSON; makes runs resume.")
     ] = None,
@@ -132,9 +147,9 @@ def evaluate(
     kept beside the result: the same command goes on after an interruption.
     """
     from streamfeat.evaluate.page import check_page, write_page
-    from streamfeat.evaluate.plan import Trial, parse_sweep, plan_cells
+    from streamfeat.evaluate.plan import TRAINING_PRESETS, WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
     from streamfeat.evaluate.run import evaluate as run
-    from streamfeat.evaluate.run import save_result, state_path
+    from streamfeat.evaluate.run import read_result, save_result, state_path
     from streamfeat.evaluate.splits import DataSet
 
     if early_samples < 0:
@@ -144,13 +159,20 @@ def evaluate(
             refuse_existing(path, *recordings, overwrite=overwrite)
     if page:
         check_page(page)
+    earlier = read_result(against) if against else None
     base = options.setting_given(context) | {
         "mirror": mirror,
         "cuts": cuts,
         "shift": shift,
         "kernel": kernel,
+        "test_mirror": test_mirror,
+        "select": select,
         "model": str(model or ""),
     }
+    for name, value in TRAINING_PRESETS.get(preset, {}).items():
+        source = context.get_parameter_source(name)
+        if source and source.name == "DEFAULT":
+            base[name] = value
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
@@ -165,6 +187,8 @@ def evaluate(
             data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups, reading)
             print_assumptions(data.assumptions)
             report("reading labels", 1, 1, "")
+            if not WITHOUT_KERNELS.issuperset(methods):
+                compile_first(quiet=quiet)
             result = run(
                 data,
                 plan_cells(methods, base, parsed, data.n_folds),
@@ -172,6 +196,7 @@ def evaluate(
                 state=state_path(output) if output else None,
                 report=report,
                 workers=place,
+                against=earlier,
                 finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
@@ -203,12 +228,17 @@ def _in_short(row: dict[str, Any]) -> str:
         to, difference = "base" if row["swept"] else "the first", row["difference"]
         low, high = difference["low"], difference["high"]
         line += f", to {to} {difference['accuracy']:+.4f} ({low:+.4f} to {high:+.4f})"
+    if "against" in row:
+        difference = row["against"]
+        low, high = difference["low"], difference["high"]
+        line += f", to the earlier one {difference['accuracy']:+.4f} ({low:+.4f} to {high:+.4f})"
     return f"[dim]{escape(line)}[/]"
 
 
 def _print(result: dict[str, Any]) -> None:
     from streamfeat.evaluate.tables import (
         COLUMNS,
+        against_table,
         base_rows,
         cells,
         confusion_table,
@@ -220,30 +250,22 @@ def _print(result: dict[str, Any]) -> None:
     )
 
     columns = [column.replace(", ", ",\n").replace("% ", "%\n") for column in COLUMNS]
-    _show("accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
+    print_table(out, "accuracy", columns, [cells(row) for row in base_rows(result)], left=(0, 2))
     header, rows = fold_table(result)
     if rows:
-        _show("accuracy of each fold", header, rows)
+        print_table(out, "accuracy of each fold", header, rows)
     for name, (header, rows) in sweep_tables(result):
-        _show(f"sweep of {name.replace('_', ' ')}", header, rows)
+        print_table(out, f"sweep of {name.replace('_', ' ')}", header, rows)
+    header, rows = against_table(result)
+    if rows:
+        print_table(out, "to the first row of the earlier result", header, rows)
     header, rows = early_table(result)
     if rows:
-        _show("early decision", header, rows)
+        print_table(out, "early decision", header, rows)
     header, rows = online_table(result)
     if rows:
-        _show("online, predicting before learning", header, rows)
+        print_table(out, "online, predicting before learning", header, rows)
     for row in base_rows(result) if len(result["labels"]) <= _WIDEST_CONFUSION else []:
-        _show(f"confusion of {row['method']}", *confusion_table(row, result["labels"]))
+        print_table(out, f"confusion of {row['method']}", *confusion_table(row, result["labels"]))
     for note in notes(result):
         out.print(f"[yellow]{escape(note)}[/]" if note.startswith("WARNING") else f"[dim]{escape(note)}[/]")
-
-
-def _show(
-    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)
-) -> None:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for i, column in enumerate(header):
-        table.add_column(escape(column), justify="left" if i in left else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    out.print(table)

@@ -21,7 +21,8 @@ from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.events import Events
 from streamfeat.kernels import cache
 from streamfeat.report.machine import Disturbance, describe_machine
-from streamfeat.simulate.saccades import CameraModel, digit_samples
+from streamfeat.simulate.camera import CameraModel
+from streamfeat.simulate.saccades import digit_samples
 
 __all__ = ["EXTRAS", "examine"]
 
@@ -31,6 +32,7 @@ EXTRAS = {
     "convert": "Prophesee HDF5 files",
     "export": "Arrow, Parquet and pandas",
     "plot": "pages and pictures of results",
+    "simulate": "events of images and videos",
     "store": "recordings by URL",
     "view": "Foxglove",
     "bench": "peers in tools/bench",

@@ -22,9 +22,9 @@ from streamfeat.cli.program import (
     err,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 
 if TYPE_CHECKING:

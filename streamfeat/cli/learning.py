@@ -25,15 +25,16 @@ from streamfeat.cli.program import (
     TopicOption,
     WorkersOption,
     app,
+    compile_first,
     completing,
     err,
     model_or_general,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
 
@@ -87,6 +88,7 @@ def learn(
     volumes: options.Volumes = None,
     iterations: options.Iterations = None,
     seed: options.Seed = None,
+    scales: options.Scales = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Go on from this model; recordings and all other options as it was learned with."),
@@ -128,7 +130,9 @@ def learn(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
             )
     except KeyboardInterrupt:
-        err.print("[yellow]interrupted[/] before an iteration was done; nothing was written")
+        err.print(
+            "[yellow]interrupted[/] before an iteration was done, or all scales were; nothing was written"
+        )
         raise typer.Exit(130) from None
     encoder.save(model)
     part.unlink(missing_ok=True)
@@ -137,6 +141,7 @@ def learn(
         "formulation": encoder.formulation,
         "filters": encoder.n_filters,
         "features": encoder.n_features,
+        "scales": len(encoder.scales),
         "volumes": encoder.provenance["volumes"],
         "empty_share": encoder.provenance["empty_share"],
         "iterations": encoder.provenance["iterations"],
@@ -212,6 +217,18 @@ def train(
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
     kernel: options.Kernel = "linear",
+    select: Annotated[
+        int | None,
+        typer.Option(
+            help="Keep so many filters of the model, those that a linear classifier leans on; needs "
+            "--selected-model.",
+            show_default="all",
+        ),
+    ] = None,
+    selected_model: Annotated[
+        Path | None,
+        typer.Option(help="With --select: the model of those filters, which the classifier is for."),
+    ] = None,
     topic: TopicOption = None,
     cluster: ClusterOption = None,
     workers: WorkersOption = None,
@@ -228,11 +245,18 @@ def train(
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
     from streamfeat.classify.kernel import train_kernel_classifier
+    from streamfeat.classify.selection import with_best_filters
     from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
 
     refuse_existing(classifier, *recordings, model, overwrite=overwrite)
+    if (select is None) != (selected_model is None):
+        raise InputError(
+            "--select and --selected-model go together: how many filters, and the model to write"
+        )
+    if selected_model:
+        refuse_existing(selected_model, *recordings, model, classifier, overwrite=overwrite)
     kind = groups_named(groups)
     variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
     if kernel not in ("linear", "rbf"):
@@ -247,11 +271,20 @@ def train(
                     f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
                     "or write them with `streamfeat convert`"
                 )
+        compile_first(quiet=quiet)
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)
         if samples.held_out.all():
             raise InputError(f"{recordings[0]}: every sample is of a held-out split; nothing to train on")
+        if select is not None and selected_model:
+            rows, labels, _ = training_set(samples)
+            parts = assign_folds(labels, samples.sources[~samples.held_out].tolist(), folds, kind)
+            report("choosing filters", 0, 1, f"{select:,} of {encoder.n_filters:,}")
+            ranking = train_classifier(rows, labels, encoder, parts=parts)
+            encoder = with_best_filters(encoder, ranking, select)
+            report("choosing filters", 1, 1, "")
+            samples = encode_recordings(encoder, opened, report, workers=place)
         others = [encode_recordings(encoder, opened, report, variant=v, workers=place) for v in variants]
         report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, others)
@@ -263,9 +296,12 @@ def train(
     if kernel == "rbf":
         found = train_kernel_classifier(rows, trained, np.asarray(labels), parts[numbers])
     found.save(classifier)
+    if selected_model:
+        encoder.save(selected_model)
     held_out = samples.rows[samples.held_out]
     result: dict[str, Any] = {
         "written": str(classifier),
+        "selected_model": str(selected_model) if selected_model else None,
         "labels": list(trained.labels),
         "kernel": kernel,
         "samples": len(samples.rows) - len(held_out),

@@ -33,10 +33,11 @@ from streamfeat.cli.program import (
     print_json,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
+    tell_compiling,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import (
     HotPixels,
     Isolated,
@@ -169,7 +170,7 @@ def listen(
     verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The main job on live topics: one engine for each camera, results published beside it."""
+    """Live topics to features and predictions: an engine for each camera, results published beside it."""
     from streamfeat.live.listen import ListenJob
     from streamfeat.live.network import Network
     from streamfeat.live.shard import Shard
@@ -203,6 +204,7 @@ def listen(
         names, chosen, classifier, metrics=metrics, shard=share, announced=announced, console=err, **common
     )
     to_terminal = str(json_lines) == "-"
+    tell_compiling(quiet=quiet)
     job.run(
         Outputs(
             console=None if quiet or as_json or to_terminal else out,

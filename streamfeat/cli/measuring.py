@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from streamfeat.cli.program import (
     JsonOption,
@@ -24,15 +23,17 @@ from streamfeat.cli.program import (
     ThreadsOption,
     TopicOption,
     app,
+    compile_first,
     completing,
     err,
     model_or_general,
     out,
     print_json,
-    progress_bars,
     refuse_existing,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
+from streamfeat.cli.tables import print_table
 
 if TYPE_CHECKING:
     from streamfeat.latency.measure import LatencyReport
@@ -79,6 +80,14 @@ def latency(
         float, typer.Option(help="Pace of end to end: 1 is the recorded one, 2 twice that.")
     ] = 1.0,
     split: Annotated[str | None, typer.Option(help="Measure on samples of this split only.")] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="Updates of others beside: hats, hots, hfirst, gabor-snn or counts; may be repeated.",
+            autocompletion=completing("hats", "hots", "hfirst", "gabor-snn", "counts"),
+        ),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Draw to this file: .html (interactive) or .png; extra `plot`.")
     ] = None,
@@ -109,8 +118,10 @@ def latency(
         speed=speed,
         look_ahead=look_ahead,
         threads=threads,
+        methods=methods or (),
     )
     print_assumptions(report.assumptions)
+    compile_first(quiet=quiet)
     try:
         with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")
@@ -135,16 +146,8 @@ def _print(report: "LatencyReport") -> None:
 
     for name in dict.fromkeys(row.model.name for row in report.rows):
         rows = [row for row in report.rows if row.model.name == name]
-        title = escape(describe(rows[0].model))
-        table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-        for column in COLUMNS[:2]:
-            table.add_column(column, overflow="fold")
-        for column in COLUMNS[2:]:
-            name, style = column.replace("/", "\n/"), "bold" if column == "p50" else ""
-            table.add_column(name, justify="right", style=style, overflow="fold")
-        for row in rows:
-            table.add_row(*map(escape, cells(row)))
-        out.print(table)
+        columns = [column.replace("/", "\n/") for column in COLUMNS]
+        print_table(out, describe(rows[0].model), columns, [cells(row) for row in rows], left=(0, 1), keys=2)
     for note in notes(report):
         out.print(f"[dim]{escape(note)}[/]")
     if report.steal is not None and report.steal > _NOTABLE_STEAL:

@@ -30,6 +30,7 @@ __all__ = [
     "Pooling",
     "Preset",
     "Rows",
+    "Scales",
     "Seed",
     "Shift",
     "Start",
@@ -137,6 +138,16 @@ Iterations = Annotated[
     int | None, typer.Option(help="Alternations at most.", show_default=_shown("iterations"))
 ]
 Seed = Annotated[int | None, typer.Option(help="Of every random choice.", show_default=_shown("seed"))]
+
+Scales = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATCH@DOWNSAMPLE+...",
+        help="Further scales, whose features stand behind those of the first: 8@2+12@2 are patches of 8 and "
+        "of 12 pixels at half the resolution, 8/4@2:2 one at stride 4 with two bins; none for one scale.",
+        show_default=_shown("scales"),
+    ),
+]
 
 Mirror = Annotated[
     bool, typer.Option("--mirror", help="Train the classifier on mirror images of its samples as well.")

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from streamfeat.cli.program import err, out, print_json, progress_bars
+from streamfeat.cli.program import err, out, print_json
+from streamfeat.cli.progress import progress_bars
 from streamfeat.errors import InputError, printable
 from streamfeat.files.locations import Location, location_of
 

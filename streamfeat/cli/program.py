@@ -7,28 +7,17 @@ Not here: the commands.
 import contextlib
 import json
 import os
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from streamfeat.cli.consoles import err, out
 from streamfeat.cli.results import RESULTS, complete, for_people
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import is_replaced, refuse_input
@@ -56,20 +45,31 @@ __all__ = [
     "WebPortOption",
     "WorkersOption",
     "app",
+    "compile_first",
     "completing",
     "err",
     "out",
     "print_json",
     "print_losses",
     "print_result",
-    "progress_bars",
     "refuse_existing",
+    "tell_compiling",
     "working",
 ]
 
-_ORDER = ("demo", "info", "convert", "learn", "label", "train", "replay", "evaluate", "latency", "view")
-_PIPE_COLUMNS = 1_000
-_PIPE_COLUMNS = 1_000
+_ORDER = (
+    "demo",
+    "info",
+    "convert",
+    "simulate",
+    "learn",
+    "label",
+    "train",
+    "replay",
+    "evaluate",
+    "latency",
+    "view",
+)
 _LAST = ("listen", "publish", "record", "recover", "topics", "doctor")
 
 
@@ -98,20 +98,6 @@ app = typer.Typer(
 )
 
 
-class _WholeConsole(Console):
-    """A console that cuts nothing where it is no terminal: what reads a pipe or a file has room."""
-
-    @property  # type: ignore[misc]
-    def size(self) -> ConsoleDimensions:
-        size = super().size
-        cuts = self.is_terminal or "COLUMNS" in os.environ
-        return size if cuts else ConsoleDimensions(_PIPE_COLUMNS, size.height)
-
-
-out = _WholeConsole(highlight=False, emoji=False)
-err = _WholeConsole(stderr=True, highlight=False, emoji=False)
-
-
 @app.callback()
 def _options(
     version: Annotated[
@@ -120,8 +106,18 @@ def _options(
             "--version", is_eager=True, callback=lambda asked: _tell_version(asked), help="Print the version."
         ),
     ] = False,
+    unpack: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BYTES",
+            help="Let a file unpack to so much, such as 4G, where that is over 64M and 200 times the file.",
+        ),
+    ] = None,
 ) -> None:
-    pass
+    if unpack is not None:
+        from streamfeat.files.budget import VARIABLE, parse_bytes
+
+        os.environ[VARIABLE] = str(parse_bytes(unpack))  # which processes that this one starts have, too
 
 
 def _tell_version(asked: bool) -> None:
@@ -206,88 +202,6 @@ WorkersOption = Annotated[
     int | None, typer.Option(help="Number of processes of this machine to work in; extra `cluster`.")
 ]
 
-_NARROW = 90
-"""Columns below which bars are short, so that rate and time left stay in sight."""
-
-
-class _RateColumn(ProgressColumn):
-    """Steps a second, once there are some."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:,.{0 if speed >= 10 else 1}f}/s" if speed else "", style="dim")
-
-
-Report = Callable[[str, int, int, str], None]
-"""Called with (step, done, of how many, remark); of how many is 0 where that is unknown."""
-
-
-@contextlib.contextmanager
-def progress_bars(
-    *, from_a_thread: bool = True, quiet: bool = False, as_lines: bool = False, below: Console = err
-) -> Iterator[Report]:
-    """A function that keeps a bar for each step on standard error.
-
-    A bar says how many are done, how many a second, and how long the rest will take. Nothing is shown where
-    standard error is no terminal.
-
-    Args:
-        from_a_thread: keep the bars moving from a thread; without, they are drawn only when the function is
-            called, once a second at most, so that nothing else runs during a measurement.
-        quiet: show nothing.
-        as_lines: in place of bars a line for each step's begin and end, and one a second between them,
-            terminal or not.
-        below: what lines are printed to meanwhile; if that is a terminal, the bars stay below them.
-    """
-    if quiet or not (as_lines or err.is_terminal):
-        yield lambda step, done, total, remark: None
-        return
-    if as_lines:
-        yield _lines()
-        return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=40 if err.width >= _NARROW else 10),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(compact=True, elapsed_when_finished=True),
-        TextColumn("[dim]{task.fields[remark]}"),
-    )
-    with Progress(
-        *columns,
-        console=below if below.is_terminal else err,
-        auto_refresh=from_a_thread,
-        redirect_stdout=False,  # what goes to a file while bars are shown is not for the terminal
-    ) as progress:
-        tasks: dict[str, Any] = {}
-        drawn = 0.0
-
-        def report(step: str, done: int, total: int, remark: str) -> None:
-            nonlocal drawn
-            if step not in tasks:
-                tasks[step] = progress.add_task(step, total=total or None, remark="")
-            progress.update(tasks[step], completed=done, total=total or None, remark=escape(remark))
-            if not from_a_thread and time.monotonic() > drawn + 1:
-                progress.refresh()
-                drawn = time.monotonic()
-
-        yield report
-
-
-def _lines() -> Report:
-    """A function that prints steps as lines."""
-    printed: dict[str, float] = {}
-
-    def report(step: str, done: int, total: int, remark: str) -> None:
-        now = time.monotonic()
-        if step not in printed or done == total > 0 or now > printed[step] + 1:
-            printed[step] = now
-            count = f" {done:,}/{total:,}" if total else f" {done:,}" if done else ""
-            err.print(f"{escape(step)}{count}  [dim]{escape(remark)}[/]", soft_wrap=True)
-
-    return report
-
 
 @contextlib.contextmanager
 def working(cluster: str | None, workers: int | None, *, quiet: bool) -> Iterator["Workers"]:
@@ -322,6 +236,25 @@ def model_or_general(model: Path | None) -> Path:
             soft_wrap=True,
         )
     return model or GENERAL_MODEL
+
+
+def compile_first(*, quiet: bool) -> None:
+    """Compile the kernels that every encoder needs, on two cores; nothing where that was done before."""
+    from streamfeat.stream.compiling import compile_together
+
+    tell_compiling(quiet=quiet)
+    compile_together()
+
+
+def tell_compiling(*, quiet: bool) -> None:
+    """Say why nothing else is said for half a minute, where kernels were not compiled before."""
+    from streamfeat.stream.compiling import is_compiled
+
+    if not quiet and not is_compiled():
+        err.print(
+            "[dim]compiling:[/] kernels, once for this version; it takes half a minute or more",
+            soft_wrap=True,
+        )
 
 
 def print_losses(losses: "Losses") -> None:

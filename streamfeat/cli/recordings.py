@@ -23,19 +23,41 @@ from streamfeat.cli.program import (
     err,
     print_losses,
     print_result,
-    progress_bars,
     working,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
-from streamfeat.files.locations import location_of
+from streamfeat.files.locations import Location, location_of
 
 if TYPE_CHECKING:
     from streamfeat.recordings.options import ReadOptions
 
-__all__ = ["convert", "info"]
+__all__ = [
+    "GapOption",
+    "HoldOutOption",
+    "InterleavedOption",
+    "LimitOption",
+    "convert",
+    "info",
+    "listed_faults",
+    "print_faults",
+]
 
 _FAULTS_SHOWN = 20
+
+Faults = dict[str, list[tuple[Location, str]]]
+"""By what became of them, files and the reason of each."""
+
+HoldOutOption = Annotated[
+    str | None,
+    typer.Option(metavar="I/N", help="Block I of N of each class is split 'validation', else 'train'."),
+]
+InterleavedOption = Annotated[
+    int | None, typer.Option(help="Every n-th sample is 'validation': only where neighbours differ.")
+]
+LimitOption = Annotated[int | None, typer.Option(help="Take only so many samples, classes in balance.")]
+GapOption = Annotated[float, typer.Option(help="Silence between samples; at least one window.")]
 
 
 @app.command(epilog="Example: streamfeat info recordings/digits_test.mcap")
@@ -78,6 +100,11 @@ def info(
             "read": rec.topic,
             "encoding": rec.encoding,
             "resolution": list(rec.resolution),
+            "other_resolutions": [
+                {"resolution": list(size), "packets": n}
+                for size, n in rec.resolutions.items()
+                if size != rec.resolution
+            ],
             "events": n_events,
             "on": rec.n_on,
             "off": rec.n_off,
@@ -116,16 +143,11 @@ def convert(
     crop: Annotated[
         str | None, typer.Option(metavar="X,Y,W,H", help="Take these pixels only; X,Y becomes 0,0.")
     ] = None,
-    hold_out: Annotated[
-        str | None,
-        typer.Option(metavar="I/N", help="Block I of N of each class is split 'validation', else 'train'."),
-    ] = None,
-    interleaved: Annotated[
-        int | None, typer.Option(help="Every n-th sample is 'validation': only where neighbours differ.")
-    ] = None,
+    hold_out: HoldOutOption = None,
+    interleaved: InterleavedOption = None,
     split: Annotated[str | None, typer.Option(help="Split of all samples, whatever folders say.")] = None,
-    limit: Annotated[int | None, typer.Option(help="Convert only so many, classes in balance.")] = None,
-    gap_ms: Annotated[float, typer.Option(help="Silence between samples; at least one window.")] = 1000.0,
+    limit: LimitOption = None,
+    gap_ms: GapOption = 1000.0,
     encoding: Annotated[str, typer.Option(help="Payload: mono, libcaer_cmp, libcaer or evt3.")] = "mono",
     compression: Annotated[str, typer.Option(help="Chunks: zstd, lz4 or none.")] = "zstd",
     cluster: ClusterOption = None,
@@ -209,12 +231,24 @@ def convert(
     }
     faults = {"failed": done.failed, "damaged": done.damaged}
     if as_json:
-        result["faults"] = [
-            {"file": str(path), "what": what, "reason": reason}
-            for what, files in faults.items()
-            for path, reason in files
-        ]
+        result["faults"] = listed_faults(faults)
     print_result(result, "converted", as_json=as_json, command="convert")
+    print_faults(faults, verbose=verbose)
+    if done.failed or done.damaged:
+        raise typer.Exit(1)
+
+
+def listed_faults(faults: Faults) -> list[dict[str, str]]:
+    """Faults as JSON has them."""
+    return [
+        {"file": str(path), "what": what, "reason": reason}
+        for what, files in faults.items()
+        for path, reason in files
+    ]
+
+
+def print_faults(faults: Faults, *, verbose: bool) -> None:
+    """Say on standard error what is wrong with which file; the first of each kind only, unless `verbose`."""
     for what, files in faults.items():
         shown = files if verbose else files[:_FAULTS_SHOWN]
         for path, reason in shown:
@@ -223,5 +257,3 @@ def convert(
             err.print(f"[yellow]{what}:[/] {escape(where)}", soft_wrap=True)
         if len(shown) < len(files):
             err.print(f"[yellow]{what}:[/] {len(files) - len(shown):,} more; --verbose lists all")
-    if done.failed or done.damaged:
-        raise typer.Exit(1)

@@ -77,6 +77,11 @@ RESULTS: dict[str, dict[str, Field]] = {
         "read": Field("text", "the event topic that is read", "topic read"),
         "encoding": Field("text", "of its packets"),
         "resolution": Field("[int]", "height and width of the sensor, in pixels"),
+        "other_resolutions": Field(
+            "[object]",
+            "`resolution` and `packets` of what has another: its own crop, or a change midway",
+            "also",
+        ),
         "events": Field("int", "events that can be used"),
         "on": Field("int", "ON events", "ON"),
         "off": Field("int", "OFF events", "OFF"),
@@ -129,6 +134,15 @@ RESULTS: dict[str, dict[str, Field]] = {
         "faults": Field("[object]", "`file`, `what` and `reason` of each"),
         "removed": _REMOVED,
     },
+    "simulate": {
+        "written": _WRITTEN,
+        "samples": Field("int", "images that were simulated; 1 for a film"),
+        "events": Field("int", "events in the file"),
+        "bytes_out": Field("int", "of the file"),
+        "failed": Field("int", "images that could not be read, or give no events", quiet=True),
+        "damaged": Field("int", "frames or parts of a film that could not be read", quiet=True),
+        "faults": Field("[object]", "`file`, `what` and `reason` of each"),
+    },
     "label": {
         "labels": Field("text?", "the label file; null if nothing was labelled", "label file"),
         "samples": Field("int", "labels in it", "labels"),
@@ -139,13 +153,18 @@ RESULTS: dict[str, dict[str, Field]] = {
         "written": _WRITTEN,
         "formulation": Field("text", "`direct` or `inverse`"),
         "filters": Field("int", "filters, or atoms"),
-        "features": Field("int", "numbers that an emission has"),
-        "volumes": Field("int", "local volumes that were learned from"),
-        "empty_share": Field("number", "share of volumes without events, which were left out"),
+        "features": Field("int", "numbers that an emission has", "numbers per emission"),
+        "scales": Field("int", "scales whose features stand side by side", quiet=True),
+        "volumes": Field("int", "local volumes that were learned from", "patches learned from"),
+        "empty_share": Field(
+            "number", "share of volumes without events, which were left out", "patches without events"
+        ),
         "iterations": Field("int", "passes over them"),
-        "objective": Field("[number]", "objective at the first and at the last iteration"),
-        "condition": Field("number", "condition number of the learned matrix; 1 is best"),
-        "coherence": Field("number", "largest likeness of two filters, 0 to 1"),
+        "objective": Field(
+            "[number]", "objective at the first and at the last iteration", "error and penalty"
+        ),
+        "condition": Field("number", "condition number of the learned matrix; 1 is best", hidden=True),
+        "coherence": Field("number", "largest likeness of two filters, 0 to 1", hidden=True),
         "unused": Field("int", "filters that no volume uses", quiet=True),
         "bytes": Field("int", "of the file"),
         "log_determinant": Field(
@@ -154,6 +173,9 @@ RESULTS: dict[str, dict[str, Field]] = {
     },
     "train": {
         "written": _WRITTEN,
+        "selected_model": Field(
+            "text?", "with --select: the model of the filters that were kept", quiet=True
+        ),
         "labels": Field("[text]", "names of the classes"),
         "kernel": Field("text", "`linear` or `rbf`"),
         "samples": Field("int", "samples that were trained on"),
@@ -352,8 +374,14 @@ def _text(name: str, value: Any) -> str:
         # A camera file has a format instead, and no messages.
         count = f", {value['messages']:,} messages" if value["messages"] or value["schema_encoding"] else ""
         return f"{value['name']} ({value['schema']}{count})"
+    if isinstance(value, Mapping) and value.keys() == {"resolution", "packets"}:
+        return f"{_text('resolution', value['resolution'])} ({value['packets']:,} packets)"
+    if name == "other_resolutions" and len(value) > 3:
+        return f"{_text(name, value[:3])} and {len(value) - 3} others"
     if name == "objective":
-        return f"{value[0]:.6g} to {value[-1]:.6g}"
+        return f"{value[0]:.6g} at first, {value[-1]:.6g} at last"
+    if name == "empty_share":
+        return f"{100 * value:.0f} %"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):

@@ -20,8 +20,8 @@ from streamfeat.cli.program import (
     out,
     print_json,
     print_result,
-    progress_bars,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.errors import InputError
 
 __all__ = ["demo", "doctor"]

@@ -28,9 +28,10 @@ from streamfeat.cli.program import (
     out,
     print_losses,
     print_result,
-    progress_bars,
     refuse_existing,
+    tell_compiling,
 )
+from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def replay(
     verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The main job on a recording: events to features to predictions, scored where there are labels."""
+    """A recording to features and predictions, scored where there are labels."""
     from streamfeat.stream.outputs import Outputs
     from streamfeat.stream.replay import ReplayJob, parse_speed
 
@@ -97,6 +98,7 @@ def replay(
     )
     print_assumptions(job.assumptions)
     to_terminal = str(json_lines) == "-"
+    tell_compiling(quiet=quiet or err.is_terminal)  # where there is a terminal, there is a bar
     with progress_bars(quiet=quiet or (to_terminal and out.is_terminal), below=out) as report:
         job.run(
             Outputs(

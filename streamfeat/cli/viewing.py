@@ -25,6 +25,7 @@ from streamfeat.cli.program import (
     model_or_general,
     print_result,
     refuse_existing,
+    tell_compiling,
 )
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.errors import InputError
@@ -68,6 +69,10 @@ def view(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Where Foxglove connects, on loopback; 0 is any.")
     ] = 8765,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URL", help="Let this page connect, too, such as a Foxglove of your own."),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Write pictures and plots to this MCAP file; extra `view`."),
@@ -131,6 +136,7 @@ def view(
         threads=threads,
         web_port=web_port if on_page else None,
         foxglove_port=port if foxglove else None,
+        origins=origin or (),
         recording_out=output,
         open_browser=has_display() if open_browser is None else open_browser,
         say=lambda line: None if quiet else err.print(escape(line), soft_wrap=True),
@@ -138,6 +144,8 @@ def view(
     )
     if recording:
         print_assumptions(job.assumptions)
+    if model or features or classifier:
+        tell_compiling(quiet=quiet)
     if layout:
         job.write_layout(layout, "" if recording else ros2 or str(source))
     job.run()

@@ -14,7 +14,7 @@ import numpy as np
 
 from streamfeat.camera_files.event_files import EXTENSIONS
 from streamfeat.convert.sample_files import RECORDED, bytes_of, is_recorded, open_sample
-from streamfeat.convert.splits import SamplePath, hold_out_block, interleave, split_named, spread
+from streamfeat.convert.splits import SamplePath, chosen, split_named
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
@@ -24,7 +24,17 @@ from streamfeat.recordings.reader import Label
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["Conversion", "SamplePath", "convert", "find_samples", "is_data_set"]
+__all__ = [
+    "Conversion",
+    "KnownSet",
+    "Look",
+    "Measured",
+    "SamplePath",
+    "convert",
+    "find_samples",
+    "is_data_set",
+    "write_samples",
+]
 
 _ENDINGS = (*EXTENSIONS, *RECORDED)
 _LONGEST_SAMPLE_US = 3_600_000_000  # an hour; one damaged time must not push all later samples away
@@ -50,7 +60,7 @@ class Conversion:
 
 
 @dataclass(frozen=True, slots=True)
-class _DataSet:
+class KnownSet:
     """Facts of a data set that stand in its documentation and not in its files."""
 
     duration_us: int
@@ -62,13 +72,13 @@ class _DataSet:
 # In these the clock of a file starts with the sample. N-CARS: Sironi et al. (2018), crops of 100 ms, first
 # event always at 0. N-MNIST and N-Caltech101: Orchard et al. (2015), three saccades of 100 ms, first event up
 # to 7 ms after the start; some files run on to 316 ms.
-_NCARS = _DataSet(100_000, None)
-_NMNIST = _DataSet(300_000, (34, 34))
-_NCALTECH101 = _DataSet(300_000, None)
+_NCARS = KnownSet(100_000, None)
+_NMNIST = KnownSet(300_000, (34, 34))
+_NCALTECH101 = KnownSet(300_000, None)
 
 
 @dataclass(frozen=True, slots=True)
-class _Measured:
+class Measured:
     """One file after a first look: its batches (in memory, or read again) and what all of them show."""
 
     batches: Iterable[Events]
@@ -78,14 +88,14 @@ class _Measured:
     last_us: int
 
 
-_NOTHING = _Measured((), (1, 1), 0, 0, 0)
+_NOTHING = Measured((), (1, 1), 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class Look:
     """The outcome of reading one file, and its bytes."""
 
-    file: _Measured
+    file: Measured
     damage: str = ""
     size: int = 0
     error: str = ""
@@ -96,7 +106,7 @@ def is_data_set(place: Location) -> bool:
     return is_folder(place) and not is_bag(place)
 
 
-def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
+def find_samples(folder: str | Path | StoreLocation, endings: tuple[str, ...] = _ENDINGS) -> list[SamplePath]:
     """Find the labelled samples of a data set folder.
 
     A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
@@ -106,6 +116,7 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
 
     Args:
         folder: or its URL.
+        endings: of the names of files that are samples, in small letters.
 
     Returns:
         Samples sorted by `source`, their path relative to `folder` with forward slashes.
@@ -123,7 +134,7 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     for path, source in _outside_bags(files, bags):
         *above, _ = parts = source.split("/")
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
-        is_sample = source in bags or path.name.lower().endswith(_ENDINGS)
+        is_sample = source in bags or path.name.lower().endswith(endings)
         if hidden or not is_sample or not above:
             continue
         if len(above) == 1 and split_named(above[0]):
@@ -133,7 +144,7 @@ def find_samples(folder: str | Path | StoreLocation) -> list[SamplePath]:
     if not samples:
         raise InputError(
             f"{folder}: holds no samples; expected LABEL/FILE or SPLIT/LABEL/FILE with files ending in "
-            f"{' '.join(sorted(_ENDINGS))}"
+            f"{' '.join(sorted(endings))}"
         )
     return sorted(samples, key=lambda sample: sample.source)
 
@@ -211,23 +222,13 @@ def convert(
     source, out = location_of(source), location_of(out)
     if isinstance(out, StoreLocation):
         raise InputError(f"{out}: recordings are written to local files; give one, and copy it to the store")
-    if gap_us <= 0 or (limit is not None and limit <= 0) or (interleaved is not None and interleaved < 2):
-        raise InputError("gap_us and limit must be positive, interleaved at least 2")
-    if sum(choice is not None for choice in (split, hold_out, interleaved)) > 1:
-        raise InputError("--split, --hold-out and --interleaved exclude each other; give one")
     samples = find_samples(source)
     data_set = _recognise(samples)
-    if hold_out is not None:
-        samples = hold_out_block(samples, *hold_out)
-    elif interleaved is not None:
-        samples = interleave(samples, interleaved)
-    elif split is not None:
-        samples = [replace(sample, split=split) for sample in samples]
-    if limit is not None:
-        samples = spread(samples, limit)
+    samples = chosen(samples, gap_us, split, hold_out, interleaved, limit)
     denoiser = Denoiser(denoising or Denoising())
     with RecordingWriter(out, encoding=encoding, compression=compression, overwrite=overwrite) as writer:
-        done = _write_samples(samples, data_set, gap_us, writer, denoiser, progress, workers)
+        looks = workers.map(_look, ((sample.path, data_set) for sample in samples))
+        done = write_samples(samples, data_set, gap_us, writer, denoiser, progress, looks)
     return replace(done, bytes_out=out.stat().st_size, removed=denoiser.removed)
 
 
@@ -237,7 +238,7 @@ def _of_place(error: InputError, path: Location, place: Location) -> str:
 
 
 def _write_events(
-    path: Location, file: _Measured, shift_us: int, writer: RecordingWriter, denoiser: Denoiser
+    path: Location, file: Measured, shift_us: int, writer: RecordingWriter, denoiser: Denoiser
 ) -> int:
     """Write the events of a sample without their noise; return how many."""
     denoiser.restart()
@@ -253,18 +254,31 @@ def _write_events(
     return n
 
 
-def _write_samples(
+def write_samples(
     samples: Sequence[SamplePath],
-    data_set: _DataSet | None,
+    data_set: KnownSet | None,
     gap_us: int,
     writer: RecordingWriter,
     denoiser: Denoiser,
     progress: Callable[[int, int], None] | None,
-    workers: Workers,
+    looks: Iterable["Look | None"],
 ) -> Conversion:
+    """Write samples one after the other, each with its label before it and a silence of `gap_us` behind it.
+
+    Args:
+        samples: in the order in which they are written.
+        data_set: nominal facts; None where each sample begins with its first event and ends with its last.
+        gap_us: see `convert`.
+        writer: open.
+        denoiser: takes noise out of each.
+        progress: see `convert`.
+        looks: of each sample what was found in it; None for one that is to be read here.
+
+    Raises:
+        InputError: no sample can be read, or one cannot be written.
+    """
     failed, damaged = [], []
     n_events, bytes_in, start_us = 0, 0, gap_us
-    looks = workers.map(_look, ((sample.path, data_set) for sample in samples))
     for done, (sample, look) in enumerate(zip(samples, looks, strict=True), 1):
         with contextlib.ExitStack() as copies:
             if look is None:  # it is large
@@ -288,7 +302,7 @@ def _write_samples(
     return Conversion(len(samples) - len(failed), n_events, failed, damaged, bytes_in, 0)
 
 
-def _look(place: Location, data_set: _DataSet | None) -> "_Look | None":
+def _look(place: Location, data_set: KnownSet | None) -> "Look | None":
     """Read a file, if it is small enough to be held."""
     with _local(place) as path:
         with contextlib.suppress(OSError, InputError):  # what is wrong with it is found when it is read
@@ -302,18 +316,18 @@ def _local(place: Location) -> contextlib.AbstractContextManager[Location]:
     return contextlib.nullcontext(place) if is_recorded(place) else fetched(place)
 
 
-def _look_at(path: Location, place: Location, data_set: _DataSet | None) -> "_Look":
+def _look_at(path: Location, place: Location, data_set: KnownSet | None) -> "Look":
     """Read a file, which is at `path` now."""
     try:
         file, damage = _measure(path, data_set)
         if file.last_us - (0 if data_set else file.first_us) >= _LONGEST_SAMPLE_US:
             raise InputError(f"{path}: lasts to {file.last_us} us, longer than an hour; damaged?")
     except InputError as error:
-        return _Look(_NOTHING, error=_of_place(error, path, place))
-    return _Look(file, damage, bytes_of(path))
+        return Look(_NOTHING, error=_of_place(error, path, place))
+    return Look(file, damage, bytes_of(path))
 
 
-def _measure(path: Location, data_set: _DataSet | None) -> tuple[_Measured, str]:
+def _measure(path: Location, data_set: KnownSet | None) -> tuple[Measured, str]:
     """Read a file once, for its extent in space and time; hold its events only when it is small."""
     file = open_sample(path)
     batches: Iterable[Events] = file if is_recorded(path) or bytes_of(path) > _HELD_IN_MEMORY else [*file]
@@ -331,10 +345,10 @@ def _measure(path: Location, data_set: _DataSet | None) -> tuple[_Measured, str]
         raise InputError(
             f"{path}: events cover {width}x{height} pixels, its data set {resolution[1]}x{resolution[0]}"
         )
-    return _Measured(batches, resolution, n, first_us, last_us), "; ".join(file.damage)
+    return Measured(batches, resolution, n, first_us, last_us), "; ".join(file.damage)
 
 
-def _recognise(samples: Sequence[SamplePath]) -> _DataSet | None:
+def _recognise(samples: Sequence[SamplePath]) -> KnownSet | None:
     labels = {sample.label for sample in samples}
     endings = {sample.path.suffix.lower() for sample in samples}
     if endings == {".dat"} and labels <= {"cars", "background"}:

@@ -13,7 +13,7 @@ from streamfeat.classify.folds import block_numbers
 from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 
-__all__ = ["SamplePath", "hold_out_block", "interleave", "parse_hold_out", "split_named", "spread"]
+__all__ = ["SamplePath", "chosen", "hold_out_block", "interleave", "parse_hold_out", "split_named", "spread"]
 
 _SPLITS = {
     "train": "train",
@@ -90,3 +90,29 @@ def spread(samples: Sequence[SamplePath], limit: int) -> list[SamplePath]:
     listed = list(groups.values())
     taken = [listed[i][turn] for turn, i in order[:limit]]
     return sorted(taken, key=lambda sample: sample.source)
+
+
+def chosen(
+    samples: list[SamplePath],
+    gap_us: int,
+    split: str | None,
+    hold_out: tuple[int, int] | None,
+    interleaved: int | None,
+    limit: int | None,
+) -> list[SamplePath]:
+    """The samples and splits that are asked for; arguments as those of `datasets.convert`.
+
+    Raises:
+        InputError: an argument is out of range, or two exclude each other.
+    """
+    if gap_us <= 0 or (limit is not None and limit <= 0) or (interleaved is not None and interleaved < 2):
+        raise InputError("gap_us and limit must be positive, interleaved at least 2")
+    if sum(choice is not None for choice in (split, hold_out, interleaved)) > 1:
+        raise InputError("--split, --hold-out and --interleaved exclude each other; give one")
+    if hold_out is not None:
+        samples = hold_out_block(samples, *hold_out)
+    elif interleaved is not None:
+        samples = interleave(samples, interleaved)
+    elif split is not None:
+        samples = [replace(sample, split=split) for sample in samples]
+    return samples if limit is None else spread(samples, limit)

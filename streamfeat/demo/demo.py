@@ -24,7 +24,8 @@ from streamfeat.learn.settings import Setting
 from streamfeat.messages.packets import Packet
 from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter
-from streamfeat.simulate.saccades import CameraModel, digit_samples
+from streamfeat.simulate.camera import CameraModel
+from streamfeat.simulate.saccades import digit_samples
 from streamfeat.stream.compiling import Compilers
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline

@@ -7,8 +7,8 @@ Not here: learning the matrices (`learn`), and anything that changes as events c
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, cast
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import check_operator, fixed_fields, n_features, quantise
+from streamfeat.engine.scales import check_scales, joined_parts, places_of, separate_parts
 from streamfeat.engine.window import encode_window
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution, as_events
@@ -29,6 +30,7 @@ __all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
 FORMAT_VERSION = 1
 
 _KIND = "streamfeat-encoder"
+_SCALES_KIND = "streamfeat-scales"
 
 Formulation = Literal["direct", "inverse"]
 Encoding = Literal["soft", "split", "triangle"]
@@ -75,6 +77,8 @@ class Encoder(Shown):
         mean: `(d,)` float32, `mu`.
         operator: the integers applied online; for kernels.
         provenance: how it was learned (JSON values).
+        further: encoders of one scale whose features stand behind those of this one, see `side_by_side`. All
+            other attributes are of the first scale.
     """
 
     geometry: Geometry
@@ -86,6 +90,40 @@ class Encoder(Shown):
     mean: NDArray[np.float32]
     operator: Operator
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    further: tuple["Encoder", ...] = ()
+
+    @classmethod
+    def side_by_side(cls, scales: "Sequence[Encoder]") -> "Encoder":
+        """One encoder of several scales, with the features of each, one behind the other.
+
+        A sensor must have room for the first scale; where it has none for a further one, the features of that
+        scale are zero.
+
+        Example:
+            >>> both = Encoder.side_by_side([fine, coarse])
+            >>> both.n_features == fine.n_features + coarse.n_features
+            True
+
+        Args:
+            scales: the first is that with the most bins; bins are equally long in all.
+
+        Raises:
+            InputError: they do not go together, or one of them has several scales itself.
+        """
+        check_scales([scale.geometry for scale in scales])
+        if any(scale.further for scale in scales):
+            raise InputError("a scale of an encoder cannot have several scales itself")
+        return replace(scales[0], further=tuple(scales[1:]))
+
+    @property
+    def scales(self) -> tuple["Encoder", ...]:
+        """An encoder for each scale."""
+        return (replace(self, further=()), *self.further) if self.further else (self,)
+
+    @property
+    def places(self) -> list[slice]:
+        """Where the features of each scale stand."""
+        return places_of([n_features(self.operator), *(scale.n_features for scale in self.further)])
 
     @classmethod
     def build(
@@ -157,17 +195,19 @@ class Encoder(Shown):
             if name == "shape":
                 continue  # of the sensor
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        for scale in self.further:
+            digest.update(scale.fingerprint.encode())
         return digest.hexdigest()
 
     @property
     def n_filters(self) -> int:
-        """Number of filters or atoms, `K`."""
+        """Number of filters or atoms, `K`, of the first scale."""
         return self.operator.n_filters
 
     @property
     def n_features(self) -> int:
-        """Length of a feature vector: `K` for each cell, or `2 K` for `split`."""
-        return n_features(self.operator)
+        """Length of a feature vector: `K` for each cell, or `2 K` for `split`; of all scales together."""
+        return n_features(self.operator) + sum(scale.n_features for scale in self.further)
 
     def encode(
         self,
@@ -196,10 +236,24 @@ class Encoder(Shown):
             InputError: `events` are no events.
         """
         events = as_events(events)
-        return encode_window(self.geometry, self.operator, events, resolution, origin_us, t_us)
+        features = np.zeros(self.n_features, np.float32)
+        for number, (place, one) in enumerate(zip(self.places, (self, *self.further), strict=True)):
+            if number == 0 or one.geometry.has_room(resolution):
+                features[place] = encode_window(
+                    one.geometry, one.operator, events, resolution, origin_us, t_us
+                )
+        return features
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file; the file appears whole or not at all."""
+        if self.further:
+            parts = joined_parts([scale._parts() for scale in self.scales])
+            write_safetensors(Path(path), _SCALES_KIND, FORMAT_VERSION, *parts)
+        else:
+            write_safetensors(Path(path), _KIND, FORMAT_VERSION, *self._parts())
+
+    def _parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Arrays and header of the first scale."""
         operator = self.operator
         arrays = {"filters": self.filters, "whitening": self.whitening, "mean": self.mean}
         arrays |= {name: getattr(operator, name) for name in _STORED_ARRAYS}
@@ -211,18 +265,20 @@ class Encoder(Shown):
             "scalars": {name: getattr(operator, name) for name in _STORED_SCALARS},
             "provenance": dict(self.provenance),
         }
-        write_safetensors(Path(path), _KIND, FORMAT_VERSION, arrays, header)
+        return arrays, header
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> "Encoder":
         """Read a model. Every shape, type and range is checked, and nothing in the file is run.
 
         Raises:
             InputError: the file is missing, cut short, of another version, or not a model.
         """
-        arrays, header = read_safetensors(Path(path), _KIND, FORMAT_VERSION)
+        arrays, header = read_safetensors(Path(path), (_KIND, _SCALES_KIND), FORMAT_VERSION)
         try:
-            return cls._from_parts(arrays, header)
+            if header["format"] == _KIND:
+                return cls._from_parts(arrays, header)
+            return cls.side_by_side([cls._from_parts(*parts) for parts in separate_parts(arrays, header)])
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: not a usable model: {one_line(error)}; learn it again") from error
 

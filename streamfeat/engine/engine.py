@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
-from streamfeat.engine.snapshot import Snapshot, check_snapshot, checked_time
+from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
 from streamfeat.engine.threads import Crew
 from streamfeat.events import Events, Resolution, as_events
@@ -51,7 +51,7 @@ class EngineStats:
         events: accepted and counted.
         late: older than the window; they changed nothing.
         rejected: outside the sensor, polarity not 0 or 1, or time beyond 2^62; they changed nothing.
-        saturated: accepted, but the clipped count stayed as it was.
+        saturated: accepted, but the clipped count stayed as it was; in the first scale, as all of the above.
         rolls: bins that stream time has moved on by.
         active_volumes: volumes that were not empty when features were last read.
         encoded_volumes: volumes encoded so far, a measure of the work done.
@@ -78,7 +78,7 @@ class Engine(Shown):
         threads: that share the work of a large emission; features have the same bits for any number.
 
     Raises:
-        InputError: the sensor has no place for a single volume, or so many that sums could overflow; the
+        InputError: the sensor has so many volumes that sums could overflow; the
             origin is beyond 2^62 microseconds; or threads are not 1 to 256.
     """
 
@@ -105,6 +105,11 @@ class Engine(Shown):
             planes=2 if look_ahead else 1,
             threads=threads,
         )
+        self._further = [
+            (place, Engine(scale, resolution, origin_us=origin_us, look_ahead=look_ahead, threads=threads))
+            for place, scale in zip(encoder.places[1:], encoder.further, strict=True)
+            if scale.geometry.has_room(resolution)
+        ]
 
     def feed(self, batch: Events) -> None:
         """Count the events of a batch. Exact, whatever the order, and cheap.
@@ -119,6 +124,8 @@ class Engine(Shown):
         """
         events = self._checked(batch)
         count_events(events, self._operator, self._state)
+        for _, scale in self._further:
+            scale.feed(events)
 
     def follow(self, batch: Events) -> None:
         """Feed a batch event by event, with features brought up to date after each.
@@ -134,6 +141,8 @@ class Engine(Shown):
         events = self._checked(batch)
         self._update()
         follow(events, self._operator, self._state)
+        for _, scale in self._further:
+            scale.follow(events)
 
     def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Feed a batch event by event, and read the features after each.
@@ -153,13 +162,19 @@ class Engine(Shown):
         features = np.empty((len(events), n_features(self._operator)), np.float32)
         accepted = np.empty(len(events), np.int64)
         trace(events, self._operator, self._state, features, accepted)
-        return features, accepted
+        if not self.encoder.further:
+            return features, accepted
+        every = np.zeros((len(events), self.encoder.n_features), np.float32)
+        every[:, : features.shape[1]] = features
+        for place, scale in self._further:
+            every[:, place] = scale.trace(events)[0]
+        return every, accepted
 
     def prepare(self, columns: int) -> bool:
         """Use idle time to look ahead to the next bin boundary.
 
         Args:
-            columns: operator columns that may be added, a bound of the work.
+            columns: operator columns that may be added, a bound of the work, for each scale.
 
         Returns:
             whether nothing is left to prepare.
@@ -167,7 +182,7 @@ class Engine(Shown):
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
         left = look_ahead(volumes, volumes, columns, self._operator, self._state)
-        return bool(left > 0)
+        return bool(left > 0) and all(scale.prepare(columns) for _, scale in self._further)
 
     def _update(self) -> None:
         """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
@@ -223,17 +238,23 @@ class Engine(Shown):
         new = since // self._operator.bin_us
         if new > self._state.clock[CLOCK_NOW]:
             advance_to_bin(new, self._operator, self._state)
+        for _, scale in self._further:
+            scale.advance(t_us)
 
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
         if self._crew.threads > 1:
             self._update()
-        features = np.empty(n_features(self._operator), np.float32)
-        read(self._operator, self._state, features)
+        features = np.zeros(self.encoder.n_features, np.float32)
+        read(self._operator, self._state, features[: n_features(self._operator)])
+        for place, scale in self._further:
+            features[place] = scale.features()
         return features
 
     def codes(self) -> NDArray[np.float32]:
-        """The code of every local volume, a copy: `(rows, columns, K)` float32, before any split."""
+        """The code of every local volume of the first scale, a copy: `(rows, columns, K)` float32, before any
+        split.
+        """
         self._update()
         state, operator = self._state, self._operator
         plane = state.clock[CLOCK_PLANE]
@@ -245,13 +266,15 @@ class Engine(Shown):
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
     def counts(self) -> NDArray[np.int32]:
-        """The signed counts of the current window, a copy: `(n_bins, H, W)` int32, the oldest bin first, not
-        clipped.
+        """The signed counts of the current window in the first scale's ring, a copy: `(n_bins, H, W)` int32,
+        the oldest bin first, not clipped.
         """
         return np.roll(self._state.counts, -1 - int(self._state.clock[CLOCK_SLOT]), axis=0)
 
     def activity(self) -> NDArray[np.int64]:
-        """The sum of squared entries of every local volume, a copy: `(rows, columns)` int64; 0 is empty."""
+        """The sum of squared entries of every local volume of the first scale, a copy: `(rows, columns)`
+        int64; 0 is empty.
+        """
         self._update()
         squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
         return squares.reshape(self.grid_shape).copy()
@@ -274,6 +297,8 @@ class Engine(Shown):
         encoded = int(self._state.encoded.sum())
         plane = self._state.clock[CLOCK_PLANE]
         active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
+        for seen in [scale.stats() for _, scale in self._further]:
+            active, encoded = active + seen.active_volumes, encoded + seen.encoded_volumes
         return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
 
     def restart(self, origin_us: int) -> None:
@@ -291,6 +316,8 @@ class Engine(Shown):
         state.clock[:] = 0
         state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
         state.clock[CLOCK_ORIGIN] = origin
+        for _, scale in self._further:
+            scale.restart(origin)
 
     def snapshot(self) -> Snapshot:
         """Copy the state. Projections and codes are not part of it: they follow from the counts.
@@ -316,6 +343,7 @@ class Engine(Shown):
             origin_us=int(state.clock[CLOCK_ORIGIN]),
             tally=state.tally.copy(),
             encoded=np.array([state.encoded.sum(), 0]),
+            further=tuple(scale.snapshot() for _, scale in self._further),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -327,7 +355,7 @@ class Engine(Shown):
             InputError: the snapshot is of another encoder or another resolution, or of no engine at all;
                 nothing has changed.
         """
-        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state)
+        self._check(snapshot)
         state, limit = self._state, self._operator.max_count
         codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
         self.restart(snapshot.origin_us)
@@ -344,3 +372,11 @@ class Engine(Shown):
         state.tally[:] = snapshot.tally
         state.encoded[:] = 0
         state.encoded[0] = snapshot.encoded.sum()
+        for (_, scale), further in zip(self._further, snapshot.further, strict=True):
+            scale.restore(further)
+
+    def _check(self, snapshot: Snapshot) -> None:
+        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state)
+        check_further(snapshot, len(self._further))
+        for (_, scale), further in zip(self._further, snapshot.further, strict=True):
+            scale._check(further)

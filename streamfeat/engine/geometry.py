@@ -64,22 +64,18 @@ class Geometry:
         return self.n_bins * self.bin_us
 
     def ring_shape(self, resolution: Resolution) -> tuple[int, int]:
-        """Rows and columns of ring pixels for a sensor of `(height, width)` pixels."""
-        height, width = resolution
-        return -(-height // self.downsample), -(-width // self.downsample)
+        """Rows and columns of ring pixels for a sensor of `(height, width)` pixels.
+
+        A sensor smaller than a volume has pixels that never fire to its right and below it.
+        """
+        height, width = (max(-(-side // self.downsample), self.patch) for side in resolution)
+        return height, width
+
+    def has_room(self, resolution: Resolution) -> bool:
+        """Whether a sensor of `(height, width)` pixels has a place for a volume without such pixels."""
+        return all(-(-side // self.downsample) >= self.patch for side in resolution)
 
     def grid_shape(self, resolution: Resolution) -> tuple[int, int]:
-        """Rows and columns of volumes for a sensor of `(height, width)` pixels.
-
-        Raises:
-            InputError: the sensor has no place for a single volume.
-        """
+        """Rows and columns of volumes for a sensor of `(height, width)` pixels; at least one of each."""
         rows, columns = self.ring_shape(resolution)
-        if min(rows, columns) < self.patch:
-            height, width = resolution
-            raise InputError(
-                f"geometry: a sensor of {width}x{height} pixels is {columns}x{rows} after downsample "
-                f"{self.downsample}, too small for one volume of {self.patch}x{self.patch}; "
-                "use a model with a smaller patch or downsample"
-            )
         return (rows - self.patch) // self.stride + 1, (columns - self.patch) // self.stride + 1

@@ -14,7 +14,7 @@ from streamfeat.errors import InputError
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import BEFORE_TIME, Operator, State
 
-__all__ = ["Snapshot", "check_snapshot", "checked_time"]
+__all__ = ["Snapshot", "check_further", "check_snapshot", "checked_time"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +29,7 @@ class Snapshot:
         origin_us: stream time at which bin 0 starts.
         tally: `(5,)` int64, what was counted.
         encoded: `(2,)` int64, their sum is how many volumes were encoded.
+        further: of the further scales that the sensor has room for.
     """
 
     fingerprint: str
@@ -38,6 +39,7 @@ class Snapshot:
     origin_us: int
     tally: NDArray[np.int64]
     encoded: NDArray[np.int64]
+    further: tuple["Snapshot", ...] = ()
 
 
 def checked_time(t_us: int) -> int:
@@ -84,3 +86,16 @@ def check_snapshot(snapshot: Snapshot, fingerprint: str, operator: Operator, sta
     checked_time(snapshot.origin_us)
     if snapshot.bin != BEFORE_TIME:
         checked_time(snapshot.origin_us + snapshot.bin * operator.bin_us)
+
+
+def check_further(snapshot: Snapshot, n: int) -> None:
+    """Check that the further scales of a snapshot are as many, and at the same time, as the first.
+
+    Raises:
+        InputError: they are not.
+    """
+    if len(snapshot.further) != n:
+        raise InputError(f"the snapshot has {len(snapshot.further)} further scales, this engine has {n}")
+    for further in snapshot.further:
+        if (further.bin, further.origin_us) != (snapshot.bin, snapshot.origin_us):
+            raise InputError("the snapshot: its scales are at different times")

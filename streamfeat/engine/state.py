@@ -45,9 +45,6 @@ def allocate_state(
         planes: 1, or 2 to look ahead.
         threads: that share the work of large emissions.
         keep: keep a projection for each volume; without, the state serves whole windows only.
-
-    Raises:
-        InputError: the sensor has no place for a volume.
     """
     rows, columns = geometry.grid_shape(resolution)
     ring = (geometry.n_bins, *geometry.ring_shape(resolution))

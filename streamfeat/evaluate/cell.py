@@ -9,11 +9,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from streamfeat.classify.calibration import confidence_bins
 from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.classify.folds import assign_folds
 from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
+from streamfeat.classify.selection import with_best_filters
 from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
@@ -27,6 +30,8 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 __all__ = ["run_cells"]
 
 _SHOWN_FILTERS = 48
+
+_MIRRORED = Variant(mirror=True)
 
 _INNER_FOLDS = 3
 """Of the training samples, by which the classifier's regularisation is chosen."""
@@ -62,14 +67,23 @@ def run_cells(
     with data.open(fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
-            features = make_features(cell.method, recordings, cell.setting, report, workers)
+            features = _features(cell, data, recordings, report, workers)
             learned = time.perf_counter()
             _compile(features, recordings)
             compiled = time.perf_counter()
             samples = encode_recordings(features, recordings, report, workers=workers)
             seconds = {PLAIN: time.perf_counter() - compiled}
             others: dict[Variant, EncodedSamples] = {}
-            for variant in dict.fromkeys(v for cell in cells for v in cell.setting.variants):
+            images: EncodedSamples | None = None
+            if any(cell.setting.test_mirror for cell in cells):
+                started_one = time.perf_counter()
+                images = encode_recordings(
+                    features, recordings, report, variant=_MIRRORED, held_out_too=True, workers=workers
+                )
+                seconds[_MIRRORED] = time.perf_counter() - started_one
+                others[_MIRRORED] = _of(images, ~samples.held_out)
+            wanted = dict.fromkeys(v for cell in cells for v in cell.setting.variants)
+            for variant in [v for v in wanted if v not in others]:
                 started_one = time.perf_counter()
                 others[variant] = encode_recordings(
                     features, recordings, report, variant=variant, workers=workers
@@ -79,7 +93,7 @@ def run_cells(
             with PeakMemory() as training:
                 variants = cell.setting.variants
                 split = _split(samples, [others[v] for v in variants], data, cell if fold is None else None)
-                result = _scored(cell, data, features, *split, report)
+                result = _scored(cell, data, features, *split, images, report)
                 if cell.fold == 0 and not cell.swept:
                     classifier = result["classifier"]
                     result |= _looked_into(
@@ -87,9 +101,33 @@ def run_cells(
                     )
             del result["classifier"]
             result["learn_s"] = round(learned - started, 3)
-            result["encode_s"] = round(sum(seconds[v] for v in (PLAIN, *variants)), 3)
+            encoded = {PLAIN, *variants} | ({_MIRRORED} if cell.setting.test_mirror else set())
+            result["encode_s"] = round(sum(seconds[v] for v in encoded), 3)
             result["peak_mb"] = max(making.peak_mb, training.peak_mb)
             yield cell, result
+
+
+def _features(
+    cell: Cell, data: DataSet, recordings: Sequence[Recording], report: Report, workers: Workers
+) -> FeatureMap:
+    """Learn what the method learns; of more filters than are wanted, labels choose."""
+    setting, times = cell.setting, cell.setting.select
+    if times == 1:
+        return make_features(cell.method, recordings, setting, report, workers)
+    many = replace(setting, filters=times * setting.filters, select=1)
+    features = make_features(cell.method, recordings, many, report, workers)
+    assert isinstance(features, Encoder)  # of the methods that are told how many filters
+    samples = encode_recordings(features, recordings, report, workers=workers)
+    rows, labels, _ = training_set(samples)
+    parts = assign_folds(
+        labels, samples.sources[~samples.held_out].tolist(), _INNER_FOLDS, data.groups, data.seed
+    )
+    report("choosing filters", 0, 1, f"{setting.filters:,} of {features.n_filters:,}")
+    chosen = with_best_filters(
+        features, train_classifier(rows, labels, features, parts=parts), setting.filters
+    )
+    report("choosing filters", 1, 1, "")
+    return chosen
 
 
 def _split(
@@ -99,11 +137,13 @@ def _split(
     held_out = data.held_out(cell.fold) if cell else None
     if held_out is None:
         return samples, [*others]
-    seen = ~held_out
-    return replace(samples, held_out=held_out), [
-        EncodedSamples(other.rows[seen], other.labels[seen], other.sources[seen], other.held_out[seen])
-        for other in others
-    ]
+    return replace(samples, held_out=held_out), [_of(other, ~held_out) for other in others]
+
+
+def _of(samples: EncodedSamples, some: NDArray[np.bool_]) -> EncodedSamples:
+    """Some of the samples."""
+    rows, labels, sources = samples.rows[some], samples.labels[some], samples.sources[some]
+    return EncodedSamples(rows, labels, sources, samples.held_out[some])
 
 
 def _scored(
@@ -112,6 +152,7 @@ def _scored(
     features: FeatureMap,
     samples: EncodedSamples,
     others: Sequence[EncodedSamples],
+    images: EncodedSamples | None,
     report: Report,
 ) -> dict[str, Any]:
     """Train and score; the classifier is part of what is found."""
@@ -121,23 +162,38 @@ def _scored(
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
     classifier: Classifier | KernelClassifier
-    classifier = linear = train_classifier(rows, labels, features, parts=parts[numbers])
-    if cell.setting.kernel == "rbf":
-        classifier = train_kernel_classifier(rows, linear, np.asarray(labels))
+    if cell.setting.kernel == "rbf":  # the linear one beside it is not scored, so it is not trained
+        beside = Classifier.untrained(labels, features)
+        classifier = train_kernel_classifier(rows, beside, np.asarray(labels), parts[numbers])
+    else:
+        classifier = train_classifier(rows, labels, features, parts=parts[numbers])
     trained = time.perf_counter()
     report("training", 1, 1, "")
-    predicted = predict_all(classifier, samples.rows[samples.held_out])
+    mirrored = images.rows[samples.held_out] if images and cell.setting.test_mirror else None
+    predicted = predict_all(classifier, samples.rows[samples.held_out], mirrored)
     true = samples.labels[samples.held_out].tolist()
-    return {
+    result: dict[str, Any] = {} if mirrored is not None else _confidence(classifier, samples)
+    return result | {
         "classifier": classifier,
         "samples": [int(np.sum(~samples.held_out)), len(true)],
         # A digit for each held-out sample in stored order: settings are compared sample by sample.
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
         "confusion": confusion(true, predicted, data.names),
         "features": features.n_features,
-        "C": classifier.provenance["C"],
+        "C": classifier.provenance.get("C"),
         "train_s": round(trained - started, 3),
     }
+
+
+def _confidence(
+    classifier: Classifier | KernelClassifier, samples: EncodedSamples
+) -> dict[str, list[list[float]]]:
+    """For the error of calibration over all folds: bins of the held-out samples whose label is known."""
+    true = samples.labels[samples.held_out]
+    known = np.isin(true, classifier.labels)
+    places = np.searchsorted(classifier.labels, true[known])
+    likely = classifier.emitted(samples.rows[samples.held_out][known])
+    return {"confidence": confidence_bins(likely, places).round(4).tolist()}
 
 
 def _looked_into(

@@ -1,7 +1,7 @@
 """From a method's name and a setting to a map from events to features.
 
 Lives here: learning with either formulation, and the filters that those are compared with.
-Not here: methods without filters (`surfaces`), and what features are good for (`cell`).
+Not here: methods that learn no filters (`surfaces`, `spiking`), and what features are good for (`cell`).
 """
 
 from collections.abc import Callable, Sequence
@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.engine.geometry import Geometry
 from streamfeat.evaluate.plan import Trial
+from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
-from streamfeat.learn.fit import learn_encoder, prepare
+from streamfeat.learn.fit import geometries_of, learn_encoder, prepare
 from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import Recording
@@ -57,6 +59,10 @@ def make_features(
         return Encoder.load(model_path(setting))
     if method == "counts":
         return CountImage()
+    if method == "hfirst":
+        return FirstSpikes()
+    if method == "gabor-snn":
+        return LeakySpikes()
     if method == "hats":
         return AveragedSurfaces.fitted(recordings)
     if method == "hots":
@@ -73,7 +79,24 @@ def _other_filters(
     method: str, recordings: Sequence[Recording], setting: Setting, report: Report, workers: Workers
 ) -> Encoder:
     """The pipeline of the direct formulation, with filters that solve another problem, or none."""
-    material = prepare(recordings, setting, report, workers)
+    geometries = geometries_of(setting, recordings, workers)
+    return Encoder.side_by_side(
+        [
+            _other_scale(method, recordings, one, geometry, report, workers)
+            for one, geometry in zip(setting.each, geometries, strict=True)
+        ]
+    )
+
+
+def _other_scale(
+    method: str,
+    recordings: Sequence[Recording],
+    setting: Setting,
+    geometry: Geometry,
+    report: Report,
+    workers: Workers,
+) -> Encoder:
+    material = prepare(recordings, setting, report, workers, geometry)
     rng = np.random.default_rng([setting.seed, 1])  # volumes were drawn from the seed alone
     if method == "random":
         return material.encoder(random_filters(setting.filters, material.geometry.entries, rng))

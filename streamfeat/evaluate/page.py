@@ -39,6 +39,8 @@ _SMALL = 260
 _MOST_COUNTS = 30
 """Classes that a confusion shows with their counts; more have room for their names only."""
 _PAIRS_SHOWN = 10
+_SHORT_NAME = 2
+"""Letters of a name that has room beside others."""
 
 Parts = list[Any]
 
@@ -94,7 +96,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
         sections.append(Section("Filters", [said_of_filters, Grid(pictures)]))
     if history := [row for row in learned if "objective" in row["learned"]]:
         said_of_it, *pictures = _convergence(history)
-        sections.append(Section("Convergence", [Folded(str(said_of_it), [Grid(pictures)])]))
+        sections.append(Section("Convergence", [Folded("how learning went", [said_of_it, Grid(pictures)])]))
     write_report(path, f"streamfeat evaluate: {', '.join(result['recordings'])}", sections)
 
 
@@ -211,13 +213,13 @@ def _confusions(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> Parts:
 def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
     counts = np.array(row["confusion"])
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    true, predicted = (index.ravel().tolist() for index in np.indices(counts.shape))
+    true, predicted = (index.tolist() for index in np.nonzero(counts))
     data = {
         "true": [names[i] for i in true],
         "predicted": [names[i] for i in predicted],
-        "share": shares.ravel(),
-        "count": [f"{count:,}" if count else "" for count in counts.ravel()],
-        "ink": ["white" if share > 0.5 else "#767e87" for share in shares.ravel()],
+        "share": shares[true, predicted],
+        "count": [f"{count:,}" for count in counts[true, predicted]],
+        "ink": ["white" if share > 0.5 else "#767e87" for share in shares[true, predicted]],
     }
     has_counts = len(names) <= _MOST_COUNTS
     plot = _plot(
@@ -245,7 +247,7 @@ def _confusion(row: dict[str, Any], names: Sequence[str]) -> "figure":
     else:
         for axis in plot.axis:
             axis.major_label_text_font_size = "9px"
-    if len(names) > 6:
+    if len(names) > 6 and max(map(len, names)) > _SHORT_NAME:
         plot.xaxis.major_label_orientation = "vertical"
     return plot
 
@@ -257,15 +259,18 @@ def _by_iteration(label: str) -> "figure":
 
 
 def _convergence(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]:
-    yield "The objective after each half-step: codes, then filters. It may not rise."
+    yield (
+        "The objective after each half-step, codes and then filters, which may not rise; the condition "
+        "number (ratio of singular values); the coherence (largest |cos| between two filters)."
+    )
     for i, row in enumerate(rows):
         objective = row["learned"]["objective"]
-        plot = _by_iteration("objective, mean over volumes")
+        plot = _by_iteration("mean objective")
         _line(plot, (np.arange(len(objective)) / 2 + 0.5).tolist(), objective, row["method"], i)
         yield _with_legend(plot)
     for name, label in (
-        ("condition", "condition number (ratio of singular values)"),
-        ("coherence", "coherence (largest |cos| between filters)"),
+        ("condition", "condition number"),
+        ("coherence", "coherence"),
     ):
         plot = _by_iteration(label)
         for i, row in enumerate(rows):
@@ -275,12 +280,14 @@ def _convergence(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figu
 
 
 def _filters(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]:
+    from bokeh.models import LinearColorMapper
     from bokeh.palettes import Greys256
 
+    grey = LinearColorMapper(palette=Greys256, low=0, high=255, nan_color="rgba(0, 0, 0, 0)")
     yield (
-        "Filters in the whitened domain (rows of A, columns of D), evenly chosen from all. Each tile shows "
-        "the time bins of one filter side by side, oldest first; grey is zero, and each filter has its "
-        "own contrast."
+        "What filters answer to, in whitened volumes (rows of A, columns of D): some of all. Each tile is "
+        "a filter with its time bins side by side, the oldest first; grey is zero, and each has its own "
+        "contrast."
     )
     for row in rows:
         shown = row["learned"]["filters"]
@@ -295,20 +302,20 @@ def _filters(rows: Sequence[dict[str, Any]]) -> Iterator["str | Table | figure"]
             title=f"{row['method']}: {len(shown)} of {row['learned']['n_filters']:,} filters",
         )
         # Rows of an image are drawn upwards; the axis runs downwards.
-        plot.image(image=[image], x=0, y=0, dw=width, dh=height, palette=Greys256)
+        plot.image(image=[image], x=0, y=0, dw=width, dh=height, color_mapper=grey)
         plot.grid.visible = False
         yield plot
 
 
-def tiled(filters: NDArray[np.float64], shape: Sequence[int]) -> NDArray[np.uint8]:
-    """One picture of `(n, d)` filters of `shape` (bins, rows, columns): 128 is zero, gaps are white."""
+def tiled(filters: NDArray[np.float64], shape: Sequence[int]) -> NDArray[np.float32]:
+    """One picture of `(n, d)` filters of `shape` (bins, rows, columns): 128 is zero, gaps are NaN."""
     bins, rows, columns = shape
     scale = np.maximum(np.abs(filters).max(axis=1, keepdims=True), 1e-12)
-    grey = np.round(128 + 127 * filters / scale).astype(np.uint8)
+    grey = np.round(128 + 127 * filters / scale)
     tiles = grey.reshape(-1, bins, rows, columns).transpose(0, 2, 1, 3)
     lines = -(-len(tiles) // _TILE_COLUMNS)
     step = rows + 2, bins * (columns + 1) + 2
-    picture = np.full((lines * step[0], _TILE_COLUMNS * step[1]), 255, np.uint8)
+    picture = np.full((lines * step[0], _TILE_COLUMNS * step[1]), np.nan, np.float32)
     for i, tile in enumerate(tiles):
         top, left = i // _TILE_COLUMNS * step[0], i % _TILE_COLUMNS * step[1]
         for b in range(bins):

@@ -12,33 +12,56 @@ from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
 
-__all__ = ["METHODS", "Cell", "Trial", "parse_sweep", "plan_cells", "used_by"]
+__all__ = [
+    "METHODS",
+    "TRAINING_PRESETS",
+    "WITHOUT_KERNELS",
+    "Cell",
+    "Trial",
+    "parse_sweep",
+    "plan_cells",
+    "used_by",
+]
 
 METHODS = {
     "direct": "learned transform (direct formulation)",
     "inverse": "learned dictionary (inverse formulation)",
     "kmeans": "spherical k-means filters",
     "random": "random filters",
-    "model": "a model that was learned before",
+    "model": "a model that was learned before, the general one that ships without -m",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
+    "hfirst": "HFirst, first spikes of oriented neurons",
+    "gabor-snn": "Gabor-SNN, spikes of leaky oriented neurons",
     "counts": "count images",
 }
 """Every method, and what it is."""
 
+WITHOUT_KERNELS = frozenset({"hats", "hots", "counts"})
+"""Methods that have no encoder, and so nothing to compile first."""
+
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
 _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING, "random": _LEARNING}
-_TRAINING = ("mirror", "cuts", "shift", "kernel")
+_TRAINING = ("mirror", "cuts", "shift", "kernel", "test_mirror")
 _OTHERS_USE = {
     "model": ("model", *_TRAINING),
     "hats": _TRAINING,
     "hots": ("seed", *_TRAINING),
+    "hfirst": _TRAINING,
+    "gabor-snn": _TRAINING,
     "counts": _TRAINING,
 }
 """Settings of methods that learn no filters here."""
 
+_MOST_TIMES = 16
+"""As many filters that may be learned to choose from."""
+
 _SAME_IN_EVERY_FOLD = ("model", "counts")
 """Methods that take nothing from the samples, so that all folds share their features."""
+
+
+TRAINING_PRESETS: dict[str, dict[str, Any]] = {"accurate": {"mirror": True, "kernel": "rbf"}}
+"""What a preset means for training, beside what it means for learning (`learn.settings.PRESETS`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +74,8 @@ class Trial(Setting):
         cuts: milliseconds after which samples are cut to be trained on as well, such as `33+67`.
         shift: pixels by which samples are moved to each side to be trained on as well.
         kernel: `linear`, or `rbf`.
+        test_mirror: add the scores of the mirror image of a sample that is scored.
+        select: so many times as many filters are learned, of which the labels of training samples choose.
     """
 
     model: str = ""
@@ -58,11 +83,17 @@ class Trial(Setting):
     cuts: str = ""
     shift: int = 0
     kernel: str = "linear"
+    test_mirror: bool = False
+    select: int = 1
 
     def __post_init__(self) -> None:
         """Check the kernel, and all that `Setting` checks."""
         if self.kernel not in ("linear", "rbf"):
             raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
+        if not 1 <= self.select <= _MOST_TIMES:
+            raise InputError(f"select is {self.select}, it must be from 1 to {_MOST_TIMES}")
+        if self.select > 1 and self.scales != "none":
+            raise InputError("filters are chosen among those of one scale; leave out --select or --scales")
         Setting.__post_init__(self)
         self.variants  # noqa: B018  (refuses what makes no sense)
 
@@ -109,9 +140,8 @@ class Cell:
 
     def has_features_of(self, other: "Cell") -> bool:
         """Whether the same features serve both, so that they need not be made twice."""
-        mine, others = (
-            replace(cell.setting, mirror=False, cuts="", shift=0, kernel="linear") for cell in (self, other)
-        )
+        plain: dict[str, Any] = {name: _DEFAULTS[name] for name in _TRAINING}
+        mine, others = (replace(cell.setting, **plain) for cell in (self, other))
         same_fold = self.fold == other.fold or self.has_features_of_all_folds
         return same_fold and (self.method, mine) == (other.method, others)
 

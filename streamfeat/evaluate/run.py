@@ -6,7 +6,7 @@ Not here: the work of a cell (`cell`), the result as text or page (`tables`, `pa
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from streamfeat.classify.calibration import error_of_bins
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.cell import run_cells
@@ -33,9 +34,9 @@ from streamfeat.files.outputs import locked_file
 from streamfeat.report.machine import describe_machine
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["StateFile", "evaluate", "save_result", "state_path"]
+__all__ = ["StateFile", "evaluate", "read_result", "save_result", "state_path"]
 
-_VERSION = 4
+_VERSION = 5
 
 _UNITS_IN_WORDS = {
     "block": "runs of neighbouring samples, 25 of each class",
@@ -155,6 +156,7 @@ def evaluate(
     report: Report = lambda step, done, total, remark: None,
     finished: Callable[[dict[str, Any]], None] = lambda row: None,
     workers: Workers = THIS_PROCESS,
+    against: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Run all cells that are not done, and add up the result (JSON values).
 
@@ -166,9 +168,10 @@ def evaluate(
         report: told about progress.
         finished: called with each row of the result when its last fold is done.
         workers: learn and encode.
+        against: an earlier result, from `read_result`; each row has its difference to the first row there.
 
     Raises:
-        InputError: see `run_cells` and `StateFile`.
+        InputError: see `run_cells` and `StateFile`; or the earlier result is of other samples.
         KeyboardInterrupt: Ctrl-C; what is finished is in `state`.
     """
     header = {
@@ -181,6 +184,7 @@ def evaluate(
         "models": _models(cells),
     } | data.identity
     rows: list[dict[str, Any]] = []
+    earlier = _hits_of(against, data) if against else ""
     with closing(StateFile(state, header)) as kept:
         leakage = check_leakage(data, report, workers)
         for i, cell in enumerate(cells):
@@ -199,6 +203,8 @@ def evaluate(
                 first = next(row for row in rows if row["method"] == cell.method) if cell.swept else rows[0]
                 if rows[-1] is not first:
                     rows[-1]["difference"] = _difference(rows[-1]["hits"], first["hits"], data.units)
+                if earlier:
+                    rows[-1]["against"] = _difference(rows[-1]["hits"], earlier, data.units)
                 finished(rows[-1])
     report("cells", len(cells), len(cells), "")
     return {
@@ -218,6 +224,37 @@ def _models(cells: Sequence[Cell]) -> dict[str, str]:
     """The models that cells take, and a digest of each: a state of other files is of another run."""
     paths = {model_path(cell.setting) for cell in cells if cell.method == "model"}
     return {str(path): Encoder.load(path).fingerprint for path in sorted(paths)}
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """A result that `save_result` wrote.
+
+    Raises:
+        InputError: the file cannot be read, or is no result.
+    """
+    try:
+        result = json.loads(path.read_bytes())
+        hits = result["rows"][0]["hits"]
+        if not (isinstance(hits, str) and hits and set(hits) <= {"0", "1"}):
+            raise ValueError("its first row has no hits")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise InputError(f"{path}: not a result of `streamfeat evaluate`: {error}") from None
+    return dict(result)
+
+
+def _hits_of(against: Mapping[str, Any], data: DataSet) -> str:
+    """The hits of the first row of an earlier result, if it is of the same samples."""
+    mine = [path.name for path in data.paths], data.names, data.scored
+    theirs = against.get("recordings"), against.get("labels"), against.get("split")
+    hits = str(against["rows"][0]["hits"])
+    if mine != theirs or len(hits) != len(data.units):
+        raise InputError(
+            f"the earlier result is of {theirs[0]}, {theirs[2]}, {len(hits):,} samples; this is {mine[0]}, "
+            f"{mine[2]}, {len(data.units):,} samples: only the same samples are compared in pairs"
+        )
+    return hits
 
 
 def save_result(path: Path, result: dict[str, Any]) -> None:
@@ -266,6 +303,9 @@ def _row(cell: Cell, folds: Sequence[dict[str, Any]], units: NDArray[np.int64]) 
         "peak_mb": max(fold["peak_mb"] for fold in folds),
         "confusion": np.sum([fold["confusion"] for fold in folds], axis=0).tolist(),
     }
+    if all("confidence" in fold for fold in folds):
+        bins = np.sum([fold["confidence"] for fold in folds], axis=0)
+        row["calibration_error"] = round(error_of_bins(bins), 4)
     for name in ("prequential", "early", "learned"):
         if name in folds[0] and not cell.swept:
             row[name] = folds[0][name]

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import encode_samples
 from streamfeat.classify.kernel import KernelClassifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.engine.encoder import FeatureMap
 from streamfeat.recordings.reader import Sample
 
@@ -30,7 +31,7 @@ SHARE = 0.9
 """Of the final accuracy: when it is reached, a decision counts as early."""
 
 _RESAMPLES = 10_000
-_TIMES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+_TIMES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 1 / 3, 0.4, 0.5, 0.6, 2 / 3, 0.7, 0.8, 0.9, 1.0)
 _FIRST_EVENTS = 50
 
 
@@ -84,9 +85,16 @@ def confusion(true: Sequence[str], predicted: Sequence[str], names: Sequence[str
     return [[int(count) for count in row] for row in matrix]
 
 
-def predict_all(classifier: Classifier | KernelClassifier, features: NDArray[np.float32]) -> list[str]:
-    """The label with the highest score for each row of `(n, F)` features."""
-    return [classifier.labels[i] for i in classifier.scores(features).argmax(axis=-1)]
+def predict_all(
+    classifier: Classifier | KernelClassifier,
+    features: NDArray[np.float32],
+    images: NDArray[np.float32] | None = None,
+) -> list[str]:
+    """The label with the highest score for each row of `(n, F)` features; those of `images` are added."""
+    scores = classifier.scores(features)
+    if images is not None:
+        scores = scores + classifier.scores(images)
+    return [classifier.labels[i] for i in scores.argmax(axis=-1)]
 
 
 def early_decision(

@@ -18,7 +18,7 @@ from streamfeat.events import Events, Resolution
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording, Sample
 
-__all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
+__all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram", "until"]
 
 _FITTED_SAMPLES = 1_000
 """Training samples whose surfaces prototypes are learned from: enough for so few prototypes."""
@@ -48,7 +48,7 @@ class CountImage:
         self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
-        x, y, p, _ = _until(events, resolution, origin_us, t_us)
+        x, y, p, _ = until(events, resolution, origin_us, t_us)
         places = (p * self.grid + y * self.grid // resolution[0]) * self.grid + x * self.grid // resolution[1]
         return np.bincount(places, minlength=self.n_features).astype(np.float32)
 
@@ -83,7 +83,7 @@ class AveragedSurfaces:
     @property
     def n_features(self) -> int:
         """Both polarities of a surface for each cell."""
-        return int(np.prod(self._shape))
+        return int(np.prod(self.shape))
 
     @property
     def fingerprint(self) -> str:
@@ -91,7 +91,8 @@ class AveragedSurfaces:
         return repr(self)
 
     @property
-    def _shape(self) -> tuple[int, int, int, int, int]:
+    def shape(self) -> tuple[int, int, int, int, int]:
+        """Rows and columns of cells, polarities, rows and columns of a surface."""
         rows, columns = (-(-side // self.cell) for side in self.resolution)
         return rows, columns, 2, 2 * self.radius + 1, 2 * self.radius + 1
 
@@ -100,10 +101,10 @@ class AveragedSurfaces:
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
         inside = min(resolution[0], self.resolution[0]), min(resolution[1], self.resolution[1])
-        x, y, p, t = _until(events, inside, origin_us, t_us)
-        sums = np.zeros(self._shape)
+        x, y, p, t = until(events, inside, origin_us, t_us)
+        sums = np.zeros(self.shape)
         add_memory_surfaces(x, y, p, t / self.tau_us, self.cell, np.zeros((2, *self.resolution)), sums)
-        rows, columns = self._shape[:2]
+        rows, columns = self.shape[:2]
         cells = np.bincount(y // self.cell * columns + x // self.cell, minlength=rows * columns)
         sums /= np.maximum(cells, 1).reshape(rows, columns, 1, 1, 1)
         return sums.ravel().astype(np.float32)
@@ -146,7 +147,7 @@ class SurfaceHistogram:
         for i, sample in enumerate(_training(recordings)):
             if i not in chosen:
                 continue
-            surfaces = blank._surfaces(*_until(sample.events, sample.resolution), sample.resolution)
+            surfaces = blank._surfaces(*until(sample.events, sample.resolution), sample.resolution)
             if len(surfaces):
                 drawn.append(surfaces[rng.integers(0, len(surfaces), each)])
         if not drawn:
@@ -172,7 +173,7 @@ class SurfaceHistogram:
         self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
-        x, y, p, t = _until(events, resolution, origin_us, t_us)
+        x, y, p, t = until(events, resolution, origin_us, t_us)
         surfaces = self._surfaces(x, y, p, t, resolution)
         # |s - c|^2 is least where c.s - |c|^2 / 2 is largest.
         likeness = surfaces @ self.prototypes.T - np.square(self.prototypes).sum(axis=1) / 2
@@ -204,10 +205,10 @@ def _training(recordings: Sequence[Recording]) -> Iterator[Sample]:
                 yield sample
 
 
-def _until(
+def until(
     events: Events, resolution: Resolution, origin_us: int | None = None, t_us: int | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """`x, y, p` and the time since the origin, in order of time, of the events that count."""
+    """The events that count, in order of time: `x, y, p` and microseconds since the origin, `(n,)` int64."""
     x, y, p, t = (events[name].astype(np.int64) for name in ("x", "y", "p", "t"))
     if len(t) == 0:
         return x, y, p, t

@@ -10,6 +10,7 @@ from streamfeat.evaluate.plan import METHODS
 
 __all__ = [
     "COLUMNS",
+    "against_table",
     "all_numbers",
     "base_rows",
     "cells",
@@ -48,11 +49,12 @@ def base_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def cells(row: dict[str, Any]) -> list[str]:
     """A row of the accuracy table, as many as `COLUMNS`."""
-    setting = row["setting"]
+    setting, learned = row["setting"], row.get("learned")
+    filters = setting.get("filters") or (learned["n_filters"] if learned else None)
     return [
         row["method"],
-        f"{setting['filters']:,}" if "filters" in setting else "",
-        _geometry(setting) if "patch" in setting else "",
+        f"{filters:,}" if filters else "",
+        _geometry(setting) if "patch" in setting else _shape(learned) if learned else "",
         f"{row['features']:,}",
         f"{row['accuracy']:.3f}",
         _interval(row),
@@ -65,7 +67,13 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def _geometry(setting: dict[str, Any]) -> str:
-    return f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    first = f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    return first if setting["scales"] == "none" else f"{first}+{setting['scales']}"
+
+
+def _shape(learned: dict[str, Any]) -> str:
+    bins, patch, _ = learned["shape"]
+    return f"{patch}x{patch}x{bins}"
 
 
 def _interval(row: dict[str, Any]) -> str:
@@ -140,6 +148,20 @@ def _name(row: dict[str, Any]) -> str:
     return f"{row['method']}, {row['swept'].replace('_', ' ')} {value_text(row['setting'][row['swept']])}"
 
 
+def against_table(result: dict[str, Any]) -> Lines:
+    """The difference of each row to the first row of an earlier result; no rows without one."""
+    return ("what", "accuracy", "difference", "95 % interval"), [
+        [
+            _name(row),
+            f"{row['accuracy']:.4f}",
+            f"{row['against']['accuracy']:+.4f}",
+            f"{row['against']['low']:+.4f} to {row['against']['high']:+.4f}",
+        ]
+        for row in result["rows"]
+        if "against" in row
+    ]
+
+
 def online_table(result: dict[str, Any]) -> Lines:
     """Prequential accuracy of each method."""
     rows = [row for row in base_rows(result) if "prequential" in row]
@@ -185,6 +207,10 @@ def notes(result: dict[str, Any]) -> list[str]:
         "kernel rbf, Gaussian kernel ridge. Encoding is of all "
         "samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
+    if errors := [
+        f"{_name(row)} {row['calibration_error']:.3f}" for row in result["rows"] if "calibration_error" in row
+    ]:
+        lines.append(f"Error of calibration of the probabilities, expected, ten bins: {', '.join(errors)}.")
     if leakage := result["leakage"]:
         lines.append(_leakage_note(leakage))
     if len(base_rows(result)) > 1:
@@ -195,7 +221,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     setting = next((row["setting"] for row in base_rows(result) if "patch" in row["setting"]), None)
     if setting:
         lines.append(
-            f"Geometry is patch x patch x bins/stride, in pixels; downsample {setting['downsample']}, counts "
+            "Geometry is patch x patch x bins/stride, in pixels, and further scales, each patch@downsample; "
+            f"downsample {setting['downsample']}, counts "
             f"clipped to {setting['max_count']}, {setting['encoding']} encoding, "
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "
             "Filters are learned without labels, from samples that are not held out."

@@ -36,8 +36,15 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
-def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def read_safetensors(
+    path: Path, kind: str | tuple[str, ...], version: int
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read all arrays of a safetensors file and the JSON header that streamfeat keeps with them.
+
+    Args:
+        path: the file.
+        kind: what it must be, or several kinds of which it must be one.
+        version: of its format.
 
     Raises:
         InputError: the file cannot be read, or its header is not of this kind and version.
@@ -58,8 +65,9 @@ def read_safetensors(path: Path, kind: str, version: int) -> tuple[dict[str, NDA
         RecursionError,
     ) as error:
         raise InputError(f"{path}: not a readable safetensors file: {one_line(error)}") from error
-    if not isinstance(header, dict) or header.get("format") != kind:
-        raise InputError(f"{path}: a safetensors file, but not a {kind} file")
+    kinds = (kind,) if isinstance(kind, str) else kind
+    if not isinstance(header, dict) or header.get("format") not in kinds:
+        raise InputError(f"{path}: a safetensors file, but not a {kinds[0]} file")
     if header.get("version") != version:
         raise InputError(
             f"{path}: format version {header.get('version')!r}, this streamfeat reads version {version}; "

@@ -63,7 +63,7 @@ def measure_end_to_end(
         nanoseconds for each emission, in order, `(n,)` int64.
 
     Raises:
-        InputError: a sensor has no place for a volume.
+        InputError: a sensor has so many volumes that sums could overflow.
     """
     engine = partial(_engine, look_ahead)
     warming = _WatchedSession(encoder, policy, clock=perf_counter, engine=engine, threads=threads)

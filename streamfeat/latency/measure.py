@@ -7,6 +7,7 @@ Not here: the measurements (`update`, `end_to_end`), how rows look (`picture`, `
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from streamfeat.errors import InputError
 from streamfeat.files.locations import Location
 from streamfeat.latency.end_to_end import measure_end_to_end
 from streamfeat.latency.histogram import Latencies
+from streamfeat.latency.others import Method, walk_method
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
@@ -55,6 +57,7 @@ class Model:
             "bins": geometry.n_bins,
             "bin_us": geometry.bin_us,
             "downsample": geometry.downsample,
+            "scales": len(encoder.scales),
         }
 
 
@@ -63,7 +66,7 @@ class Row:
     """One distribution.
 
     Attributes:
-        model: the model that was measured.
+        model: the model or method that was measured.
         emit: under which policy.
         what: the part of the way.
         latencies: their distribution.
@@ -71,7 +74,7 @@ class Row:
         walk: each event by itself, where each was timed by itself.
     """
 
-    model: Model
+    model: Model | Method
     emit: str
     what: str
     latencies: Latencies
@@ -95,6 +98,7 @@ class LatencyReport:
         speed: of the end to end, a multiple of the recorded pace.
         look_ahead: prepare bin boundaries beforehand where every event is followed.
         threads: that share a large emission, see `usable_threads`.
+        methods: methods of others whose updates are measured as well, see `others`.
 
     Raises:
         InputError: a file cannot be used, the parts do not fit each other, or an argument makes no sense.
@@ -115,6 +119,7 @@ class LatencyReport:
         speed: float = 1.0,
         look_ahead: bool = True,
         threads: int | None = None,
+        methods: Sequence[str] = (),
     ) -> None:
         """Open and check everything, without measuring."""
         for name, value, most in (("--seconds", seconds, _MOST_SECONDS), ("--speed", speed, 1e9)):
@@ -130,6 +135,7 @@ class LatencyReport:
         self._reading, self._threads = reading, usable_threads(threads)
         self._warm_up, self._limit = warm_up, limit_events
         self._seconds, self._speed, self._look_ahead = seconds, speed, look_ahead
+        self._methods = [Method(name) for name in dict.fromkeys(methods)]
         names = [path.stem for path in models]
         self._models = [
             Model(path.stem if names.count(path.stem) == 1 else str(path), Encoder.load(path))
@@ -138,7 +144,6 @@ class LatencyReport:
         with open_recording(recording, topic, reading) as rec:
             self.assumptions = rec.assumptions
             self._items = self._load(rec)
-        self._check_fit(models)
         self.rows: list[Row] = []
         self.interrupted = False
         self.clock_ns = self.python_clock_ns = 0.0
@@ -155,6 +160,8 @@ class LatencyReport:
         follow_timed(engine, first)
         engine.advance(int(first["t"][0]) + encoder.geometry.window_us)
         engine.features()
+        for method in self._methods:
+            walk_method(method, [replace(packet, events=first)], warm_up=0, goes=lambda done: True)
         self.clock_ns, self.python_clock_ns = clock_cost_ns(), python_clock_cost_ns()
 
     def run(self, report: Report, stopped: Callable[[], bool]) -> None:
@@ -170,6 +177,9 @@ class LatencyReport:
                 for emit, policy in self._policies:
                     found = self._rows_of(_Job(model, emit, policy, rec, report, stopped))
                     self.rows += [row for row in found if row.latencies.n or not stopped()]
+            for method in self._methods:
+                if not stopped():
+                    self.rows.append(self._update_of(method, report, stopped))
         self.interrupted = stopped()
         self.steal, self.preemptions = disturbance.steal_share(), disturbance.preemptions()
 
@@ -189,7 +199,7 @@ class LatencyReport:
             "look_ahead": self._look_ahead,
             "threads": self._threads,
             "interrupted": self.interrupted,
-            "models": [model.describe() for model in self._models],
+            "models": [*(m.describe() for m in self._models), *(m.describe() for m in self._methods)],
             "rows": [
                 {"model": row.model.name, "emit": row.emit, "what": row.what}
                 | ({} if row.boundary_share is None else {"boundary_share": round(row.boundary_share, 6)})
@@ -214,13 +224,10 @@ class LatencyReport:
             )
         return items
 
-    def _check_fit(self, paths: Sequence[Path]) -> None:
-        for resolution in {item.resolution for item in self._items if isinstance(item, Packet)}:
-            for path, model in zip(paths, self._models, strict=True):
-                try:
-                    model.encoder.geometry.grid_shape(resolution)
-                except InputError as error:
-                    raise InputError(f"{path}: does not fit {self._recording}: {error}") from error
+    def _update_of(self, method: Method, report: Report, stopped: Callable[[], bool]) -> Row:
+        goes = self._budget(partial(report, f"{method.name}, event"), stopped, "update")
+        took = walk_method(method, self._items, warm_up=self._warm_up, goes=goes)
+        return Row(method, "event", "update", Latencies(took))
 
     def _rows_of(self, job: "_Job") -> Iterator[Row]:
         if job.policy == EmitPolicy("events", 1):
@@ -232,7 +239,7 @@ class LatencyReport:
                 yield from step(job)
 
     def _updates(self, job: "_Job") -> Iterator[Row]:
-        goes = self._budget(job, "update")
+        goes = self._budget(job.tell, job.stopped, "update")
         found = walk(
             job.model.encoder, self._items, look_ahead=self._look_ahead, warm_up=self._warm_up, goes=goes
         )
@@ -241,14 +248,14 @@ class LatencyReport:
         yield job.row("bin boundary", Latencies(found.ns[found.begins_bin]))
 
     def _calls(self, job: "_Job") -> Iterator[Row]:
-        goes = self._budget(job, "from Python")
+        goes = self._budget(job.tell, job.stopped, "from Python")
         found = call_each(
             job.model.encoder, self._items, look_ahead=self._look_ahead, warm_up=self._warm_up, goes=goes
         )
         yield job.row("from Python", Latencies(found.ns))
 
     def _emissions(self, job: "_Job") -> Iterator[Row]:
-        goes = self._budget(job, "feed and read")
+        goes = self._budget(job.tell, job.stopped, "feed and read")
         found = feed_and_read(job.model.encoder, self._items, job.policy, warm_up=self._warm_up, goes=goes)
         each_event = np.round(found.batch_ns / found.batch_events).astype(np.int64)
         yield job.row("ingest", Latencies(each_event, found.batch_events))
@@ -278,16 +285,18 @@ class LatencyReport:
         )
         yield job.row("end to end", Latencies(took))
 
-    def _budget(self, job: "_Job", what: str) -> Callable[[int], bool]:
+    def _budget(
+        self, tell: Callable[[int, int, str], None], stopped: Callable[[], bool], what: str
+    ) -> Callable[[int], bool]:
         """Says, told how many events are done, whether to go on; the clock starts after the warm-up."""
         ends: list[float] = []
         total = self._warm_up + self._limit
 
         def goes(done: int) -> bool:
-            job.tell(done, total, what)
+            tell(done, total, what)
             if done >= self._warm_up and not ends:
                 ends.append(time.monotonic() + self._seconds)
-            return not job.stopped() and (not ends or time.monotonic() < ends[0])
+            return not stopped() and (not ends or time.monotonic() < ends[0])
 
         return goes
 

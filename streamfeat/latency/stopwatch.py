@@ -1,7 +1,7 @@
 """The stopwatch: a compiled loop that reads a clock between events.
 
-Lives here: the only compiled code that knows a clock, and all that it must know of kernels.
-Not here: kernels themselves, which know none.
+Lives here: the clock of compiled code, and the loop over events of ours.
+Not here: kernels themselves, which know no clock; the loops of others (`others`).
 
 A call from Python costs many times what an update costs, so the loop over events is compiled, and reads
 `clock_gettime(CLOCK_MONOTONIC)` after each. What lies between two readings is one update, the cost of
@@ -21,7 +21,7 @@ from streamfeat.events import Events
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.layout import BEFORE_TIME, CLOCK_NOW, Operator, State
 
-__all__ = ["clock_cost_ns", "follow_timed", "python_clock_cost_ns"]
+__all__ = ["clock_cost_ns", "follow_timed", "now", "python_clock_cost_ns"]
 
 _MONOTONIC = time.CLOCK_MONOTONIC
 _clock_gettime = ctypes.CDLL(None).clock_gettime
@@ -43,6 +43,14 @@ def follow_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDA
         current, `(n,)` int64; and whether the event began a new bin, `(n,)` bool. The first event of an
         empty engine begins none, for there is nothing yet to move on.
     """
+    ns, begins_bin = _followed(engine, events)
+    for _, scale in engine._further:  # scale after scale, so an event took what it took in each
+        ns = ns + _followed(scale, events)[0]
+    return ns, begins_bin
+
+
+def _followed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The same for one scale."""
     engine.features()  # brings the engine up to date, as `follow` does once for each call
     stamps, bins = np.empty((2, len(events) + 1), np.int64)
     _walk(
@@ -70,7 +78,8 @@ def python_clock_cost_ns(reads: int = 20_000) -> float:
 
 
 @njit(nogil=True)
-def _now(timespec: Stamps) -> int:
+def now(timespec: Stamps) -> int:
+    """Nanoseconds of the monotonic clock; `timespec` is room for two integers."""
     _clock_gettime(_MONOTONIC, timespec.ctypes)
     return timespec[0] * 1_000_000_000 + timespec[1]  # type: ignore[no-any-return]
 
@@ -78,7 +87,7 @@ def _now(timespec: Stamps) -> int:
 @njit(nogil=True)
 def _tick(timespec: Stamps, stamps: Stamps) -> None:
     for i in range(stamps.shape[0]):
-        stamps[i] = _now(timespec)
+        stamps[i] = now(timespec)
 
 
 @njit(nogil=True)
@@ -91,8 +100,8 @@ def _walk(
     bins: Stamps,
 ) -> None:
     bins[0] = state.clock[CLOCK_NOW]
-    stamps[0] = _now(timespec)
+    stamps[0] = now(timespec)
     for i in range(events.shape[0]):
         follow(events[i : i + 1], operator, state)
         bins[i + 1] = state.clock[CLOCK_NOW]
-        stamps[i + 1] = _now(timespec)
+        stamps[i + 1] = now(timespec)

@@ -5,6 +5,7 @@ Not here: tables and pictures that show them (`cli`, `picture`).
 """
 
 from streamfeat.latency.measure import LatencyReport, Model, Row
+from streamfeat.latency.others import Method
 
 __all__ = ["COLUMNS", "cells", "describe", "notes", "spell"]
 
@@ -36,9 +37,11 @@ def cells(row: Row) -> list[str]:
     ]
 
 
-def describe(model: Model) -> str:
-    """A model in one line."""
+def describe(model: Model | Method) -> str:
+    """A model or method in one line."""
     m = model.describe()
+    if "method" in m:
+        return f"{m['model']}: {m['method']}"
     return (
         f"{m['model']}: {m['formulation']}, {m['encoding']}, K = {m['filters']}, patch {m['patch']}, "
         f"stride {m['stride']}, {m['bins']} bins of {m['bin_us'] / 1000:g} ms"

@@ -81,7 +81,7 @@ def walk(
         goes: asked from time to time.
 
     Raises:
-        InputError: a sensor has no place for a volume.
+        InputError: a sensor has so many volumes that sums could overflow.
     """
     return _each_event(follow_timed, encoder, items, look_ahead, warm_up, goes)
 
@@ -178,6 +178,8 @@ def _touch(engine: Engine) -> None:
     """Write to all memory of an engine without changing it."""
     for array in engine._state:
         array += 0
+    for _, scale in engine._further:
+        _touch(scale)
 
 
 def _call_timed(engine: Engine, events: Events) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -6,7 +6,7 @@ Lives here: the order of the steps and what is written down about them. Not here
 import datetime
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from streamfeat.learn.whitening import VolumeWhitener
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Label, Losses, Recording
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["Material", "geometry_of", "learn_encoder", "prepare"]
+__all__ = ["Material", "geometries_of", "geometry_of", "learn_encoder", "learn_scale", "prepare"]
 
 _HISTORY = ("iterations", "objective", "condition", "coherence")
 """Of a model's provenance: what is continued when a model is."""
@@ -185,6 +185,27 @@ def _sample_part(
         return number, volumes, recording.losses
 
 
+def geometries_of(
+    setting: Setting, recordings: Sequence[Recording], workers: Workers = THIS_PROCESS
+) -> list[Geometry]:
+    """The geometry of each scale; bins are as long in all as in the first. See `geometry_of`."""
+    first, *others = setting.each
+    geometry = geometry_of(first, recordings, workers)
+    return [
+        geometry,
+        *(
+            replace(
+                geometry,
+                patch=other.patch,
+                stride=other.stride,
+                downsample=other.downsample,
+                n_bins=other.bins,
+            )
+            for other in others
+        ),
+    ]
+
+
 def learn_encoder(
     recordings: Sequence[Recording],
     setting: Setting,
@@ -194,14 +215,52 @@ def learn_encoder(
     keep: Keep = lambda make: None,
     workers: Workers = THIS_PROCESS,
 ) -> Encoder:
-    """Learn an encoder without labels; samples of held-out splits are not looked at.
+    """Learn an encoder without labels, scale after scale; see `learn_scale`.
+
+    With several scales there is nothing to keep before the last is learned: Ctrl-C ends all, `keep` is not
+    called, and `resume` is refused.
+
+    Raises:
+        InputError: as for `learn_scale`; or `resume` is given for several scales.
+        KeyboardInterrupt: Ctrl-C came before the first iteration was done, or while one of several scales was
+            learned.
+    """
+    geometries = geometries_of(setting, recordings, workers)
+    if len(geometries) == 1 and not (resume and resume.further):
+        return learn_scale(
+            recordings, setting, geometries[0], resume=resume, report=report, keep=keep, workers=workers
+        )
+    if resume:
+        raise InputError(
+            "a model of several scales cannot be gone on from; learn it anew, with more iterations"
+        )
+    learned: list[Encoder] = []
+    for one, geometry in zip(setting.each, geometries, strict=True):
+        learned.append(learn_scale(recordings, one, geometry, report=report, workers=workers))
+        if learned[-1].provenance["interrupted"]:
+            raise KeyboardInterrupt
+    return Encoder.side_by_side(learned)
+
+
+def learn_scale(
+    recordings: Sequence[Recording],
+    setting: Setting,
+    geometry: Geometry,
+    *,
+    resume: Encoder | None = None,
+    report: Report = lambda step, done, total, remark: None,
+    keep: Keep = lambda make: None,
+    workers: Workers = THIS_PROCESS,
+) -> Encoder:
+    """Learn an encoder of one scale without labels; samples of held-out splits are not looked at.
 
     Ctrl-C while learning ends it: the encoder is that of the last whole iteration, and is marked
     (`provenance["interrupted"]`).
 
     Args:
         recordings: open recordings; their events are decoded once.
-        setting: geometry and learning; iterations are those beyond `resume`.
+        setting: of learning; iterations are those beyond `resume`.
+        geometry: of the local volumes.
         resume: an encoder to go on from, learned from the same volumes with the same parameters.
         report: told about progress.
         keep: may save the encoder so far, which is marked as interrupted.
@@ -216,7 +275,6 @@ def learn_encoder(
     weights = {name: getattr(learner, name) for name in _WEIGHTS if hasattr(learner, name)}
     if setting.formulation == "direct" and setting.rows == "unit":
         weights = {}
-    geometry = geometry_of(setting, recordings, workers)
     if resume:
         _check_resumable(resume, setting, geometry, weights)
     material = prepare(recordings, setting, report, workers, geometry)

@@ -40,7 +40,8 @@ def learn_encoder(
 
     Args:
         recordings: one or several; paths, URLs or open recordings, which stay open.
-        preset: name of the settings that hold where nothing is given: `default`, `fast` or `paper`.
+        preset: name of the settings that hold where nothing is given: `default`, `fast`,
+            `accurate` or `paper`.
         resume: an encoder to go on from, learned from the same recordings with the same settings.
         report: called with (step, done, of how many, remark); of how many is 0 where that is unknown.
         settings: of geometry and learning, see `streamfeat.learn.settings.Setting`: `formulation`, `filters`,

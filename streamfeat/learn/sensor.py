@@ -44,7 +44,7 @@ def suited_to(recordings: Sequence[Recording], setting: Setting) -> Setting:
     sensors = [followed(recording) for recording in recordings]
     for stride, downsample in _GRIDS:
         tried = replace(setting, stride=stride, downsample=downsample)
-        if max(load_of(tried, *sensor) for sensor in sensors) <= _MOST_LOAD:
+        if max(sum(load_of(one, *sensor) for one in tried.each) for sensor in sensors) <= _MOST_LOAD:
             return tried
     return tried
 

@@ -5,7 +5,8 @@ Imports nothing that is slow to import, so that a command line can show its defa
 """
 
 import math
-from dataclasses import dataclass, fields
+import re
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 from streamfeat.errors import InputError
@@ -19,6 +20,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # A quarter of the volumes, and of the cost of an event.
     "fast": {"stride": 4},
+    # Beside the default's 12x12 pixels at stride 2, patches of 8x8 and 12x12 at half the resolution.
+    "accurate": {"scales": "8@2+12@2"},
     # Kostadinov and Scaramuzza (ICPR 2020/21): a quarter of the pixels. Counts are not clipped there; 127 is
     # what a byte holds.
     "paper": {
@@ -69,6 +72,9 @@ class Setting:
         volumes: local volumes to learn from.
         iterations: alternations at most.
         seed: of every random choice.
+        scales: further scales, `PATCH[/STRIDE][@DOWNSAMPLE][:BINS]` each, joined by `+`, such as `8@2+12@2`;
+            filters of each are learned by themselves. `none` for one scale. Where nothing is said the stride
+            and the bins are those of the setting, and downsample is 1.
 
     Raises:
         InputError: a value is out of range, or there are too few volumes for the others.
@@ -94,6 +100,7 @@ class Setting:
     volumes: int = 12_500
     iterations: int = 10
     seed: int = 0
+    scales: str = "none"
 
     def __post_init__(self) -> None:
         """Check what can be checked without a recording."""
@@ -136,6 +143,36 @@ class Setting:
             )
         if not 0 <= self.seed < 2**32:
             raise InputError(f"seed is {self.seed}, it must be from 0 to 2^32 - 1")
+        if self.scales != "none":
+            self.each  # noqa: B018  (refuses what makes no sense)
+
+    @property
+    def each(self) -> "tuple[Setting, ...]":
+        """A setting of one scale for each scale."""
+        texts = [] if self.scales == "none" else self.scales.split("+")
+        return (replace(self, scales="none"), *(self._scale(text.strip()) for text in texts))
+
+    def _scale(self, text: str) -> "Setting":
+        found = re.fullmatch(r"(\d{1,4})(?:/(\d{1,4}))?(?:@(\d{1,4}))?(?::(\d{1,4}))?", text)
+        if not found:
+            raise InputError(
+                f"scale {text!r} is not understood; give PATCH[/STRIDE][@DOWNSAMPLE][:BINS], several joined "
+                "by +, such as 8@2+12/2@2, or none"
+            )
+        patch = int(found[1])
+        stride, downsample, bins = (int(part) if part else None for part in found.groups()[1:])
+        if (bins or self.bins) > self.bins:
+            raise InputError(
+                f"scale {text!r} has more bins than the {self.bins} of the first; give those to it"
+            )
+        return replace(
+            self,
+            patch=patch,
+            stride=self.stride if stride is None else stride,
+            downsample=1 if downsample is None else downsample,
+            bins=self.bins if bins is None else bins,
+            scales="none",
+        )
 
     @property
     def penalty(self) -> float:

@@ -156,7 +156,7 @@ def sample_volumes(
     waiting: list[Volumes] = []
     n_waiting = 0
     for window in windows:
-        if min(geometry.ring_shape(window.resolution)) < geometry.patch:
+        if not geometry.has_room(window.resolution):
             continue
         one = _draw_from(window, geometry, seed, limit, per_window)
         waiting.append(one)

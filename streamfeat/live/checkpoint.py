@@ -16,12 +16,13 @@ small, and leaves a damaged or hostile one nothing to lie about that a kernel wo
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
+from streamfeat.engine.scales import MOST_SCALES
 from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
 from streamfeat.events import TIME_LIMIT
@@ -154,8 +155,8 @@ class Checkpointer:
 def _write_state(path: Path, fingerprint: str, kept: _Kept) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     for i, session in enumerate(kept.cameras.values()):
-        if session.engine:
-            arrays |= {f"{i}.{name}": getattr(session.engine, name) for name in _ARRAYS}
+        for name, scale in _scales(f"{i}", session.engine) if session.engine else ():
+            arrays |= {f"{name}.{array}": getattr(scale, array) for array in _ARRAYS}
     header = {
         "fingerprint": fingerprint,
         "saved_ns": kept.saved_ns,
@@ -165,6 +166,13 @@ def _write_state(path: Path, fingerprint: str, kept: _Kept) -> None:
     write_safetensors(path, _KIND, _VERSION, arrays, header)
 
 
+def _scales(name: str, engine: Snapshot) -> Iterator[tuple[str, Snapshot]]:
+    """The snapshot of each scale, and what the names of its arrays begin with."""
+    yield name, engine
+    for i, further in enumerate(engine.further, 1):
+        yield f"{name}.scale{i}", further
+
+
 def _to_json(session: SessionSnapshot) -> dict[str, Any]:
     """All of a session but the arrays of its engine."""
     engine = session.engine
@@ -172,8 +180,15 @@ def _to_json(session: SessionSnapshot) -> dict[str, Any]:
         "moment": asdict(session.state),
         "stats": asdict(session.stats),
         "resolution": session.resolution,
-        "engine": {"bin": engine.bin, "origin_us": engine.origin_us} if engine else None,
+        "engine": _engine_to_json(engine) if engine else None,
     }
+
+
+def _engine_to_json(engine: Snapshot) -> dict[str, Any]:
+    further = (
+        {"further": [{"fingerprint": one.fingerprint} for one in engine.further]} if engine.further else {}
+    )
+    return {"bin": engine.bin, "origin_us": engine.origin_us, **further}
 
 
 def read_state(
@@ -208,6 +223,22 @@ def read_state(
         raise InputError(f"{path}: not a usable state: {text}; delete it to start anew") from None
 
 
+def _engine(values: Fields, arrays: Mapping[str, NDArray[Any]], name: str, fingerprint: str) -> Snapshot:
+    """The snapshot of one scale; all have the same time."""
+    missing = [array for array in _ARRAYS if f"{name}.{array}" not in arrays]
+    if missing:
+        raise InputError(f"{values.where}: {missing[0]} is missing")
+    return Snapshot(
+        fingerprint=fingerprint,
+        counts=arrays[f"{name}.counts"],
+        atoms=arrays[f"{name}.atoms"],
+        bin=values.whole("bin", -TIME_LIMIT),
+        origin_us=values.whole("origin_us", -TIME_LIMIT),
+        tally=arrays[f"{name}.tally"],
+        encoded=arrays[f"{name}.encoded"],
+    )
+
+
 def _session(values: Fields, arrays: Mapping[str, NDArray[Any]], i: int, fingerprint: str) -> SessionSnapshot:
     engine = None
     resolution = resolution_in(values)
@@ -215,17 +246,11 @@ def _session(values: Fields, arrays: Mapping[str, NDArray[Any]], i: int, fingerp
         raise InputError(f"{values.where}: a sensor without an engine, or the other way round")
     if "engine" in values:
         inner = values.inner("engine")
-        missing = [name for name in _ARRAYS if f"{i}.{name}" not in arrays]
-        if missing:
-            raise InputError(f"{values.where}: {missing[0]} is missing")
-        engine = Snapshot(
-            fingerprint=fingerprint,
-            counts=arrays[f"{i}.counts"],
-            atoms=arrays[f"{i}.atoms"],
-            bin=inner.whole("bin", -TIME_LIMIT),
-            origin_us=inner.whole("origin_us", -TIME_LIMIT),
-            tally=arrays[f"{i}.tally"],
-            encoded=arrays[f"{i}.encoded"],
-        )
+        others = inner.inners("further", MOST_SCALES) if "further" in inner else []
+        further = [
+            _engine(inner, arrays, f"{i}.scale{number}", other.text("fingerprint"))
+            for number, other in enumerate(others, 1)
+        ]
+        engine = replace(_engine(inner, arrays, f"{i}", fingerprint), further=tuple(further))
     moment = SessionState.from_json(values.inner("moment"))
     return SessionSnapshot(moment, SessionStats.from_json(values.inner("stats")), resolution, engine)

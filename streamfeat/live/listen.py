@@ -205,7 +205,7 @@ class ListenJob:
                     held.enter_context(_screen(self.health, console))
                     lines = replace(outputs, console=None)
                 held.enter_context(signals_wait())
-                n_filters = self._encoder.n_filters
+                n_filters = 0 if self._encoder.further else self._encoder.n_filters
                 return lines.open(
                     self._encoder.n_features, labels, n_filters=n_filters, recording_sink=_recording_sink
                 )

@@ -345,6 +345,11 @@ class Recording(Shown):
         return self._totals.n_outside
 
     @property
+    def resolutions(self) -> dict[Resolution, int]:
+        """How many packets have each resolution, `(height, width)`, in order of appearance; 64 at most."""
+        return self._totals.resolutions
+
+    @property
     def digest(self) -> str:
         """SHA-256, hexadecimal, of all events that are used, in their order: 13 bytes each, little-endian.
 

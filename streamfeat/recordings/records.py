@@ -4,8 +4,9 @@ Lives here: framing, chunks, checksums, finding the next chunk behind damage, an
 Not here: what messages mean (`streamfeat.recordings.reader`), and writing (`streamfeat.recordings.writer`).
 
 The readers of the `mcap` package stop at the first damaged byte and believe every length they read. Here a
-length is compared with the file before it is used, one record is in memory at a time, and no record or
-uncompressed chunk may exceed `MAX_RECORD_BYTES`.
+length is compared with the file before it is used, one record is in memory at a time, no record or
+uncompressed chunk may exceed `MAX_RECORD_BYTES`, and all chunks together not the budget of a file
+(`streamfeat.files.budget`). Schemas and channels, which are kept, have a bound of their own (`unpacking`).
 """
 
 import math
@@ -19,16 +20,16 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
-import lz4.frame
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Message, Schema, Statistics
 
 from streamfeat.errors import InputError
+from streamfeat.files.budget import Budget
 from streamfeat.files.locations import Location, open_binary
 from streamfeat.recordings.losses import Losses
+from streamfeat.recordings.unpacking import MAX_RECORD_BYTES, Described, Record, records_of_chunk
 
 __all__ = [
     "MAX_RECORD_BYTES",
@@ -44,7 +45,6 @@ __all__ = [
 
 _MAGIC = b"\x89MCAP0\r\n"
 _VERSION_AT = 5
-MAX_RECORD_BYTES = 1 << 28
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 _SCAN_BYTES = 1 << 16
@@ -57,12 +57,9 @@ _CHUNK_HEAD_BYTES = 1 + 8 + 8 + 8 + 8 + 4 + 4 + 32 + 8  # with room for any name
 
 _DAMAGE = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, RuntimeError, EOFError)
 
-_CHUNK = struct.Struct("<QQQII")  # times, size and CRC of its records, length of the compression's name
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 
 _NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
-
-Record = Schema | Channel | Message
 
 
 class Block(NamedTuple):
@@ -161,6 +158,7 @@ def iter_records(
         stop: end at this byte.
     """
     size = file.seek(0, os.SEEK_END)
+    budget, described = Budget(size), Described()
     at = trusted = max(start, len(_MAGIC))  # up to `trusted`, records start where we think they do
     while True:
         if at >= end:
@@ -190,7 +188,7 @@ def iter_records(
             if following is None:
                 if reason == "truncated" and opcode == Opcode.CHUNK:
                     file.seek(at + _FRAME.size)
-                    yield from _cut_chunk(file.read(MAX_RECORD_BYTES), at)
+                    yield from described.bounded(_cut_chunk(file.read(MAX_RECORD_BYTES), at), losses)
                 return
             at = trusted = following
             continue
@@ -201,10 +199,10 @@ def iter_records(
         elif length > MAX_RECORD_BYTES:
             losses.add("oversized", length, f"byte {at}: a record of {length} bytes")
         elif opcode == Opcode.CHUNK:
-            yield from _chunk_records(file.read(length), at, losses)
+            yield from described.bounded(_chunk_records(file.read(length), at, losses, budget), losses)
             trusted = after
         else:
-            yield from _one_record(opcode, file.read(length), at, losses)
+            yield from described.bounded(_one_record(opcode, file.read(length), at, losses), losses)
         at = after
 
 
@@ -280,9 +278,9 @@ def _one_record(
         yield at, record
 
 
-def _chunk_records(body: bytes, at: int, losses: Losses) -> Iterator[tuple[int, Record]]:
+def _chunk_records(body: bytes, at: int, losses: Losses, budget: Budget) -> Iterator[tuple[int, Record]]:
     try:
-        data = _records_of_chunk(memoryview(body))
+        data = records_of_chunk(memoryview(body), budget)
     except _DAMAGE as error:
         losses.add("damaged chunk", len(body), f"byte {at}: {error or type(error).__name__}")
         return
@@ -307,34 +305,6 @@ def _cut_chunk(body: bytes, at: int) -> Iterator[tuple[int, Record]]:
             start, inner = inner + _FRAME.size, inner + _FRAME.size + length
             if inner <= len(body) and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
                 yield from _one_record(opcode, view[start:inner], at, Losses())
-
-
-def _records_of_chunk(body: memoryview) -> bytes | memoryview:
-    """Uncompress a chunk, never to more than it claims, and check its CRC."""
-    _, _, claimed, crc, name_length = _CHUNK.unpack_from(body)
-    start = _CHUNK.size + name_length + 8
-    (length,) = struct.unpack_from("<Q", body, start - 8)
-    compression, stored = bytes(body[_CHUNK.size : start - 8]), body[start : start + length]
-    if len(stored) < length:
-        raise ValueError(f"the chunk claims {length} stored bytes and holds {len(stored)}")
-    if claimed > MAX_RECORD_BYTES:
-        raise ValueError(f"the chunk claims {claimed} bytes, the limit is {MAX_RECORD_BYTES}")
-    data: bytes | memoryview = stored
-    if compression == b"zstd":
-        # `zstandard.decompress` believes the size in the frame; the stream reader takes ours.
-        try:
-            data = zstandard.ZstdDecompressor().stream_reader(stored).read(claimed + 1)
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from None
-    elif compression == b"lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=claimed + 1)
-    elif compression:
-        raise ValueError(f"unknown compression {compression.decode()!r}")
-    if len(data) != claimed:
-        raise ValueError(f"the chunk claims {claimed} bytes and holds {len(data)}")
-    if crc not in (0, zlib.crc32(data)):
-        raise ValueError("the CRC of the chunk does not match")
-    return data
 
 
 def _find_chunk(file: BinaryIO, start: int, size: int) -> int | None:

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple, Protocol
 import zstandard
 
 from streamfeat.errors import InputError
+from streamfeat.files.budget import Budget
 from streamfeat.files.locations import Location
 from streamfeat.messages.cdr import LabelMessage
 from streamfeat.messages.packets import EVENT_SCHEMAS, Label, Packet
@@ -125,16 +126,17 @@ def unpacked_message(data: bytes | memoryview) -> bytes | memoryview:
     """A message that was compressed by itself (rosbag2's `compression_mode: message`), or as it is.
 
     Raises:
-        InputError: it cannot be unpacked, or has more than `MAX_RECORD_BYTES`.
+        InputError: it cannot be unpacked, or has more than `MAX_RECORD_BYTES` or its budget.
     """
     if data[:4] != _ZSTD:  # no CDR message begins so: its first byte is 0
         return data
     try:
-        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES + 1)
+        most = min(Budget(len(data)).left, MAX_RECORD_BYTES)
+        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(most + 1)
     except zstandard.ZstdError as error:
         raise InputError(f"the compressed message cannot be unpacked: {error}") from None
-    if len(unpacked) > MAX_RECORD_BYTES:
-        raise InputError(f"the compressed message has more than {MAX_RECORD_BYTES} bytes")
+    if len(unpacked) > most:
+        raise InputError(f"the compressed message has more than {most} bytes")
     return bytes(unpacked)
 
 

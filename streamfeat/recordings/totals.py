@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from streamfeat.events import Resolution
 from streamfeat.messages.packets import Label, Packet
 
 __all__ = ["Totals"]
 
 _DIGESTED = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "u1"), ("t", "<i8")])
+
+_MOST_RESOLUTIONS = 64
 
 
 @dataclass(slots=True)
@@ -26,6 +29,8 @@ class Totals:
     n_outside: int = 0
     first_us: int | None = None
     last_us: int | None = None
+    resolutions: dict[Resolution, int] = field(default_factory=dict)
+    """Packets with events of each, of the first 64 in order of appearance."""
     hash: "hashlib._Hash" = field(default_factory=hashlib.sha256)
     _epoch: int = 0
     _span: tuple[int, int] | None = None
@@ -49,6 +54,8 @@ class Totals:
         self.n_on += on
         self.n_off += len(events) - on
         height, width = packet.resolution
+        if len(self.resolutions) < _MOST_RESOLUTIONS or packet.resolution in self.resolutions:
+            self.resolutions[packet.resolution] = self.resolutions.get(packet.resolution, 0) + 1
         self.n_outside += int(np.count_nonzero((events["x"] >= width) | (events["y"] >= height)))
         first, last = int(events["t"].min()), int(events["t"].max())
         if packet.epoch != self._epoch:

@@ -152,7 +152,7 @@ class ReplayJob:
 
             def sinks() -> Sequence[Sink[Emission]]:
                 held.enter_context(signals_wait())
-                n_filters = self._encoder.n_filters
+                n_filters = 0 if self._encoder.further else self._encoder.n_filters
                 return outputs.open(self._encoder.n_features, self._labels, n_filters=n_filters)
 
             with self.opened(sinks) as pipeline:

@@ -12,8 +12,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.classify.classifier import Classifier, OnlineClassifier
+from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.kernel import KernelClassifier
+from streamfeat.classify.online import OnlineClassifier
 from streamfeat.denoise.stage import Denoiser, Denoising
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine

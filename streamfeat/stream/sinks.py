@@ -236,7 +236,8 @@ class TerminalSink:
     def close(self, *, failed: bool) -> None:
         """Say how many samples were not shown."""
         if self._skipped:
-            self._console.print(f"[dim]... and {self._skipped} samples more, too fast to show[/]")
+            samples = "1 sample" if self._skipped == 1 else f"{self._skipped:,} samples"
+            self._console.print(f"[dim]... and {samples} more, too fast to show[/]")
 
     def _line(self, e: Emission) -> Text:
         line = Text(no_wrap=True, overflow="crop")

@@ -7,7 +7,7 @@ Pictures are `foxglove.RawImage` (mono8), everything else JSON with a schema. Lo
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
 from streamfeat.stream.cameras import MAX_CAMERAS
+from streamfeat.view.gate import FOXGLOVE_ORIGINS, Gate, GuardedPort, hidden_host
 
 __all__ = ["Board", "FileBoard", "LiveBoard"]
 
@@ -148,6 +149,7 @@ class LiveBoard(Board):
         name: of the server.
         port: on 127.0.0.1; 0 for any that is free.
         on_viewer: called, in a thread of the server's, when a client subscribes.
+        origins: of pages that may look.
 
     Raises:
         InputError: the port cannot be used.
@@ -159,27 +161,39 @@ class LiveBoard(Board):
         name: str,
         port: int,
         on_viewer: Callable[[], None] = lambda: None,
+        origins: Collection[str] = FOXGLOVE_ORIGINS,
     ) -> None:
         """Start the server."""
         super().__init__(about)
         self._on_viewer = on_viewer
+        host = hidden_host()
         try:
             self._server = foxglove.start_server(
                 name=name,
-                host="127.0.0.1",
-                port=port,
+                host=host,
+                port=0,
                 context=self._context,
                 server_listener=self,
                 message_backlog_size=_BACKLOG,
             )
         except RuntimeError as error:
             reason = str(error).rpartition("port: ")[2]
-            raise InputError(f"--port {port}: cannot listen there: {reason}; give another --port") from None
+            raise InputError(f"--foxglove: cannot listen on {host}: {reason}") from None
+        try:
+            self._guard = GuardedPort(Gate(origins), port, f"{host}:{self._server.port}")
+        except BaseException:
+            self._server.stop()
+            raise
 
     @property
     def port(self) -> int:
         """Where it listens."""
-        return int(self._server.port)
+        return self._guard.port
+
+    @property
+    def address(self) -> str:
+        """What to connect to."""
+        return self._guard.address
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         """A client has subscribed: show what was shown last."""
@@ -192,6 +206,7 @@ class LiveBoard(Board):
 
     def close(self) -> None:
         """Stop the server; clients are told."""
+        self._guard.close()
         self._server.stop()
 
 

@@ -27,6 +27,7 @@ from streamfeat.live.names import Names, beside
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.outputs import Outputs
 from streamfeat.stream.warming import warm_up
+from streamfeat.view.gate import FOXGLOVE_ORIGINS
 from streamfeat.view.labelling import LabelSheet
 from streamfeat.view.layout import foxglove_layout
 from streamfeat.view.observe import ObservedEngine
@@ -66,6 +67,7 @@ class View:
         rate: pictures a second: of the clock, or of the stream where a recording only becomes a file.
         web_port: serve the page there on 127.0.0.1; 0 for any port, None for no page.
         foxglove_port: serve Foxglove's protocol there, too; extra `view`.
+        origins: further pages that may connect there, such as `http://localhost:8080`.
         recording_out: MCAP file to write; replaced if it exists; extra `view`.
         open_browser: show the page in a browser.
         speed: of a recording, a multiple of the recorded pace; None for as fast as possible.
@@ -89,6 +91,7 @@ class View:
         rate: float = 20.0,
         web_port: int | None = 0,
         foxglove_port: int | None = None,
+        origins: Sequence[str] = (),
         recording_out: Path | None = None,
         open_browser: bool = False,
         speed: float | None = 1.0,
@@ -110,7 +113,7 @@ class View:
         if reader and self._encoder:
             reader.check_fits(self._encoder, path=classifier or "the classifier")
         self._labels = reader.labels if reader else ()
-        self._web_port, self._foxglove_port = web_port, foxglove_port
+        self._web_port, self._foxglove_port, self._origins = web_port, foxglove_port, origins
         self._recording_out, self._open_browser, self._say = recording_out, open_browser, say
         self._is_served = web_port is not None or foxglove_port is not None
         self._looked, self._stopped = Event(), Event()
@@ -226,12 +229,13 @@ class View:
         if self._foxglove_port is not None:
             from streamfeat.view.channels import LiveBoard
 
-            live = LiveBoard(known, "streamfeat view", self._foxglove_port, self._looked.set)
+            allowed = FOXGLOVE_ORIGINS | set(self._origins)
+            live = LiveBoard(known, "streamfeat view", self._foxglove_port, self._looked.set, allowed)
             opened.callback(live.close)
             self._boards.append(live)
             if self._is_recording:
                 live.announce(prefix_of(""))  # so that a viewer has something to subscribe to
-            self._say(f"Foxglove: ws://127.0.0.1:{live.port}")
+            self._say(f"Foxglove: {live.address}")
         if self._web_port is not None:
             server = PageServer(page, self._web_port, on_viewer=self._looked.set, on_asked=self._asked)
             opened.callback(server.close)

@@ -85,11 +85,16 @@ class Throttle:
         self._last = float("-inf")
 
     def is_due(self, t_us: int) -> bool:
-        """Whether it is time again, given stream time; if so, the next time is counted from here."""
+        """Whether it is time again, given stream time.
+
+        The next time is counted from when this one was due, not from when it was asked for: events come in
+        slices, and each picture would be late by a part of one. After a pause it is counted from now.
+        """
         now = self._clock() if self._clock else t_us / 1e6
-        if self._last <= now < self._last + self._interval:
+        due = self._last + self._interval
+        if self._last <= now < due:
             return False
-        self._last = now
+        self._last = due if due <= now < due + self._interval else now
         return True
 
 

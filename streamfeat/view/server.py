@@ -1,7 +1,7 @@
 """The server of the page: one port of this machine for the page, what it shows, and what it asks for.
 
-Lives here: HTTP and WebSocket on loopback, who may connect, and what a slow browser misses.
-Not here: what is shown (`sink`), what buttons do (`job`), the page itself (`page`).
+Lives here: HTTP and WebSocket on loopback, and what a slow browser misses.
+Not here: who may connect (`gate`), what is shown (`sink`), what buttons do (`job`), the page (`page`).
 
 The address holds a token that is made anew for each view. Without it, with another `Host` (a name that was
 bound to this machine from outside) or from a page of another origin, nothing is given. Of each thing that is
@@ -13,15 +13,13 @@ the browser is text, `{"op": ..., "value": ...}`, of 4,096 bytes at most.
 """
 
 import asyncio
-import hmac
 import json
 import os
-import secrets
 import struct
 from collections.abc import Callable
 from threading import Event, Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +29,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from streamfeat.errors import InputError
+from streamfeat.view.gate import MAX_CLIENTS, Gate
 
 __all__ = ["PageServer"]
 
 _MAX_ASKED_BYTES = 4096
-_MAX_BROWSERS = 16
 _MAX_CAMERAS = 64
 
 
@@ -66,7 +64,7 @@ class PageServer:
     ) -> None:
         """Start serving."""
         self._on_viewer, self._on_asked = on_viewer, on_asked
-        self._token = secrets.token_urlsafe(16)
+        self._gate = Gate()
         self._latest: dict[tuple[str, str], str | bytes] = {}
         self._browsers: list[_Browser] = []
         self._loop = asyncio.new_event_loop()
@@ -81,12 +79,12 @@ class PageServer:
             self._thread.join()
             reason = os.strerror(self._problem.errno) if self._problem.errno else self._problem
             raise InputError(f"--web-port {port}: cannot listen there: {reason}; give another --web-port")
-        self._page = make_page(self.port, self._token).encode()
+        self._page = make_page(self.port, self._gate.token).encode()
 
     @property
     def address(self) -> str:
         """The address to open in a browser; knowing it is all that is needed to look."""
-        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+        return f"http://127.0.0.1:{self.port}/?token={self._gate.token}"
 
     def picture(self, prefix: str, name: str, t_us: int, picture: NDArray[np.uint8]) -> None:
         """Show a picture, `(height, width)` uint8."""
@@ -151,18 +149,11 @@ class PageServer:
 
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
         """Give the page, refuse, or let a browser talk."""
-        names = {f"127.0.0.1:{self.port}", f"localhost:{self.port}"}
-        origin = request.headers.get("Origin")
         address = urlsplit(request.path)
-        token = parse_qs(address.query).get("token", [""])[0]
-        if request.headers.get("Host") not in names:
-            return connection.respond(403, "This is no name of this server.\n")
-        if origin is not None and origin.removeprefix("http://") not in names:
-            return connection.respond(403, "Pages of other origins may not look.\n")
-        if not hmac.compare_digest(token.encode(), self._token.encode()):
-            return connection.respond(403, "Open the address that `streamfeat view` printed.\n")
+        if refusal := self._gate.refusal(request, self.port):
+            return connection.respond(403, refusal)
         if address.path == "/stream":
-            if len(self._browsers) >= _MAX_BROWSERS:
+            if len(self._browsers) >= MAX_CLIENTS:
                 return connection.respond(503, "Too many browsers look already.\n")
             return None
         if address.path != "/":

@@ -4,6 +4,7 @@ Lives here: the sink that a view adds to a pipeline, and what its messages say.
 Not here: channels (`channels`), pictures (`pictures`), taking sights (`observe`).
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -140,7 +141,8 @@ class ViewSink:
 
     def _tell(self, e: Emission) -> None:
         assert self._encoder
-        columns = feature_columns(e.features, self._encoder.encoding, self._encoder.geometry.pooling)
+        first = e.features[self._encoder.places[0]]
+        columns = feature_columns(first, self._encoder.encoding, self._encoder.geometry.pooling)
         features = {
             "t_s": e.t_us / 1e6,
             "filters_per_column": columns.filters,
@@ -203,7 +205,8 @@ def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
         "max_count": str(geometry.max_count),
         "downsample": str(geometry.downsample),
         "pooling": str(geometry.pooling),
-        "labels": "\n".join(labels),
+        "scales": str(len(encoder.scales)),
+        "labels": json.dumps(list(labels)),
     }
 
 

@@ -415,7 +415,7 @@ MUTANTS = [
     Mutant(
         "another kind is read",
         "files/safetensors_file.py",
-        'header.get("format") != kind',
+        'header.get("format") not in kinds',
         'header.get("format") is None',
         "tests/test_golden.py -k kind",
     ),
@@ -644,9 +644,9 @@ MUTANTS = [
     ),
     Mutant(
         "noise comes in the refractory time",
-        "simulate/saccades.py",
-        "kept = _outside_refractory(pixel, t, is_noise, camera.refractory_us)",
-        "kept = _outside_refractory(pixel, t, is_noise, 0)",
+        "simulate/camera.py",
+        "kept = _outside_refractory(known, self._model.resolution, dead_us)",
+        "kept = _outside_refractory(known, self._model.resolution, 0)",
         "tests/test_simulate.py",
     ),
     Mutant(

@@ -17,10 +17,11 @@ function showLabelling() {
 function drawLabelling({ classes, labels, file, saved, problem, can_undo: canUndo }) {
   const buttons = classes.map((name, i) => {
     const button = document.createElement("button");
-    const [swatch, key] = [document.createElement("i"), document.createElement("kbd")];
+    const [swatch, text, key] = ["i", "span", "kbd"].map((tag) => document.createElement(tag));
     swatch.style.background = classColour(classes, name);
     key.textContent = i < 9 ? i + 1 : "";
-    button.append(swatch, name, key);
+    text.textContent = text.title = name;
+    button.append(swatch, text, key);
     button.className = marking.open?.name === name ? "open" : "";
     button.dataset.name = name;
     return button;
@@ -38,8 +39,12 @@ function drawLabelling({ classes, labels, file, saved, problem, can_undo: canUnd
 function hint(classes) {
   if (marking.open) return `${marking.open.name} from ${marking.open.s.toFixed(2)} s: the same key again ends it`;
   if (!classes.length) return "first name a class, such as: wave";
-  if (marking.range) return "a key from 1 to 9 names what is marked; Esc lets go of it";
-  if (marking.chosen !== null) return "drag its ends, a key names it anew, Del removes it";
+  if (marking.range) return "press the key of its class, 1 to 9; Esc lets go of it";
+  const label = chosenLabel();
+  if (label) {
+    const [start, end] = [label.start_s.toFixed(2), label.end_s.toFixed(2)];
+    return `${label.label}, ${start} to ${end} s: drag its ends, press another class's key, or Del to remove it`;
+  }
   return "press its key where a label begins and again where it ends, or drag over the timeline and press the key";
 }
 

@@ -2,6 +2,7 @@
 
 const KEPT = 200;
 const QUIET_MS = 2000;
+const MOST_LINES = 40;
 const CLASS_COLOURS = [
   "#2f7ed8", "#e8731a", "#2ca25f", "#d6336c", "#8f63d2", "#a06a42", "#e05fb6", "#8a8f98", "#a7a51c", "#17a2b8",
 ];
@@ -58,9 +59,9 @@ const listener = {
     dirty = true;
     if (channel === "about") {
       const { labels, ...about } = message;
-      model.about = { ...about, labels: labels ? labels.split("\n") : [] };
+      model.about = { ...about, labels: labels ? JSON.parse(labels) : [] };
       document.body.classList.toggle("plain", !about.formulation);
-      document.body.classList.toggle("unjudged", !labels);
+      document.body.classList.toggle("unjudged", !model.about.labels.length);
       return;
     }
     if (!model.cameras.has(camera)) {
@@ -131,7 +132,7 @@ function drawAll() {
       `stride ${about.stride}, ${about.bins} bins of ${ms(binMs)}`;
     at("bins-note").textContent = `signed counts, clipped at ±${about.max_count}, in each time bin`;
   }
-  at("volumes-note").textContent = engine ? `${engine.active_volumes} of ${engine.volumes}` : "";
+  at("volumes-note").textContent = engine ? `${engine.active_volumes.toLocaleString("en")} of ${engine.volumes.toLocaleString("en")}` : "";
   panel("events", events, (canvas) => drawPicture(canvas, events, signedColours()));
   panel("bins", bins && about?.bins, (canvas) => {
     const n = Number(about.bins);
@@ -143,10 +144,11 @@ function drawAll() {
   });
   panel("volumes", volumes, (canvas) => drawPicture(canvas, volumes, plainColours()));
   panel("features", features && about?.filters, (canvas) => drawFeatures(canvas, features));
-  drawScores(last.prediction);
+  drawScores(last.prediction, startS);
   panel("latency", model.latency.length, (canvas) =>
     drawLines(canvas, {
-      points: model.latency,
+      points: fromStart(model.latency, startS),
+      time: `${model.absolute ? "camera" : "stream"} time (s)`,
       colours: [colour("accent"), colour("off")],
       unit: "time, log scale",
       logarithmic: true,
@@ -183,7 +185,10 @@ function leaders(labels) {
   return most.map(([i]) => i).sort((a, b) => a - b);
 }
 
-function drawScores(prediction) {
+/** Points whose time is counted from a start, as in the head of the page. */
+const fromStart = (points, startS) => points.map((point) => ({ ...point, t: point.t - startS }));
+
+function drawScores(prediction, startS) {
   const { about } = model;
   if (about && !about.labels.length) {
     at("legend").replaceChildren();
@@ -199,13 +204,15 @@ function drawScores(prediction) {
   const shown = leaders(labels);
   const of = new Map(shown.map((i, place) => [labels[i], CLASS_COLOURS[place]]));
   const others = labels.map((_, i) => i).filter((i) => !shown.includes(i));
-  const order = [...others, ...shown];
+  // Lines of hundreds of classes would take longer to draw than until the next picture, and tell nothing.
+  const order = others.length <= MOST_LINES ? [...others, ...shown] : shown;
   const strips = [{ name: "predicted", colours: model.scores.map(({ label }) => of.get(label) ?? null) }];
   if (model.scores.some(({ truth }) => truth !== undefined)) {
     strips.unshift({ name: "label", colours: model.scores.map(({ truth }) => of.get(truth) ?? null) });
   }
   drawLines(at("scores"), {
-    points: model.scores.map((point) => ({ ...point, values: order.map((i) => point.values[i]) })),
+    points: fromStart(model.scores, startS).map((point) => ({ ...point, values: order.map((i) => point.values[i]) })),
+    time: `${model.absolute ? "camera" : "stream"} time (s)`,
     colours: order.map((i) => of.get(labels[i]) ?? colour("line")),
     unit: "score",
     strips,

@@ -33,7 +33,7 @@ function drawPlayer(last) {
   const most = Math.max(1, ...counts);
   const column = Math.max(x(columnS) - x(0), 0.6);
   const under = last.labels ? 18 : 0;
-  context.fillStyle = colour("line");
+  context.fillStyle = colour("bars");
   counts.forEach((count, i) => {
     const tall = (count / most) * (height - under - 4);
     context.fillRect(x(i * columnS), height - under - tall, column, tall);

@@ -158,7 +158,10 @@ function places(points) {
  * `points` are `{t, values, part}` in order: with another part, or after a long silence, a line begins anew.
  * `joined` tells whether there are lines at all, or dots. `strips` are `{name, colours}`, a colour or null for each point, drawn above the lines.
  */
-function drawLines(canvas, { points, colours, unit, logarithmic = false, joined = true, label = number, strips = [] }) {
+function drawLines(
+  canvas,
+  { points, colours, unit, time, logarithmic = false, joined = true, label = number, strips = [] },
+) {
   const { context, width, height } = cleared(canvas);
   const shown = points.flatMap(({ values }) => values.filter((value) => !logarithmic || value > 0));
   let [low, high] = [Math.min(...shown), Math.max(...shown)];
@@ -169,7 +172,7 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, joined 
     const margin = (high - low || Math.abs(high) || 1) * 0.06;
     [low, high] = [low - margin, high + margin];
   }
-  const box = { left: 66, right: width - 8, top: 8 + strips.length * 15, bottom: height - 38 };
+  const box = { left: 72, right: width - 8, top: 8 + strips.length * 15, bottom: height - 38 };
   const marks = logarithmic
     ? Array.from({ length: Math.round(Math.log10(high / low)) + 1 }, (_, i) => low * 10 ** i)
     : ticks(low, high, Math.max(3, Math.floor((box.bottom - box.top) / 36)));
@@ -180,7 +183,7 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, joined 
   const { along, step, starts } = places(points);
   const xs = along.map((place) => box.left + place * (box.right - box.left));
   const begins = points.map(({ t }, i) => ({ t, x: xs[i] })).filter((_, i) => starts[i]);
-  drawAxes(context, box, { begins, points, xs, marks, y, unit, label });
+  drawAxes(context, box, { begins, points, xs, marks, y, unit, time, label });
   colours.forEach((stroke, series) => {
     context.strokeStyle = context.fillStyle = stroke;
     context.lineWidth = 1.6;
@@ -209,7 +212,7 @@ function drawLines(canvas, { points, colours, unit, logarithmic = false, joined 
   });
 }
 
-function drawAxes(context, box, { begins, points, xs, marks, y, unit, label }) {
+function drawAxes(context, box, { begins, points, xs, marks, y, unit, time, label }) {
   context.lineWidth = 1;
   context.textAlign = "right";
   marks.forEach((mark) => {
@@ -228,7 +231,7 @@ function drawAxes(context, box, { begins, points, xs, marks, y, unit, label }) {
     context.fillText(text, x, box.bottom + 14);
     free = x + half + 14;
   });
-  context.fillText("stream time (s)", (box.left + box.right) / 2, box.bottom + 30);
+  context.fillText(time, (box.left + box.right) / 2, box.bottom + 30);
   upward(context, unit, (box.top + box.bottom) / 2);
 }
 
@@ -263,7 +266,7 @@ function upward(context, text, middle) {
 /** A panel of bars, up and down, for each cell, as the cells lie. `cells` are `{name, positive, negative}`. */
 function drawBars(canvas, cells, largest, filters, unit) {
   const { context, width, height } = cleared(canvas);
-  const [left, between, under, above] = [56, 14, 20, 28];
+  const [left, between, under, above] = [70, 14, 20, 28];
   const side = Math.sqrt(cells.length);
   const w = (width - left - (side - 1) * between - 4) / side;
   const h = (height - under - side * above) / side;
