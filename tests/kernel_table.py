@@ -895,6 +895,7 @@ def make_let_in(rng):
         state.applied[:] = 0
     ahead = int(plane != state.clock[CLOCK_PLANE])
     waiting = int(rng.integers(0, state.awaiting.shape[1]))
+    state.windows[:] = 7  # of volumes that waited before
     return plane, volume, ahead, waiting, random_part(rng, state), operator, state
 
 
