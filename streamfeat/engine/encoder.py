@@ -192,8 +192,8 @@ class Encoder(Shown):
         """SHA-256 over everything that decides what features are."""
         digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
         for name, value in zip(Operator._fields, self.operator, strict=True):
-            if name == "shape":
-                continue  # of the sensor
+            if name in ("shape", "packed"):
+                continue  # of the sensor, or columns again
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
         for scale in self.further:
             digest.update(scale.fingerprint.encode())
