@@ -72,7 +72,7 @@ _MODEL = "recordings/digits.safetensors", "recordings/digits_classifier.safetens
 
 def hours(trials: Trials) -> list[Row]:
     """Rows for what the processes hold, for latency, and for what was counted."""
-    seconds = max(40.0, _TWO_HOURS_S * trials.scale)
+    seconds = max(180.0, _TWO_HOURS_S * trials.scale)
     siege = _Siege(trials.folder, trials.folder / "siege", seconds, trials.seed)
     return _rows(siege.run(trials.say))
 
