@@ -18,9 +18,10 @@ from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
 from streamfeat.engine.threads import Crew, one_thread
+from streamfeat.engine.trace import Trace, joined, trace_events
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
-from streamfeat.kernels.follow import follow, trace
+from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
@@ -37,6 +38,7 @@ from streamfeat.kernels.layout import (
     TALLY_EVENTS,
 )
 from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
+from streamfeat.kernels.predict import Weights
 from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
 from streamfeat.report.shown import Shown
 
@@ -147,31 +149,24 @@ class Engine(Shown):
             scale.follow(events)
 
     @one_thread
-    def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Feed a batch event by event, and read the features after each.
+    def trace(self, batch: Events, weights: Weights | None = None, *, keep_features: bool = True) -> Trace:
+        """Feed a batch event by event, and read features and scores after each.
 
         Args:
             batch: as for `feed`, `n` events.
-
-        Returns:
-            features `(n, n_features)` float32, a row after each event, and `(n,)` int64, how many events
-            had been accepted by then.
+            weights: of a linear classifier for these features; no scores without.
+            keep_features: whether features are wanted, or scores alone: copying them takes time.
 
         Raises:
             InputError: as for `feed`.
         """
         events = self._checked(batch)
         self._update()
-        features = np.empty((len(events), n_features(self._operator)), np.float32)
-        accepted = np.empty(len(events), np.int64)
-        trace(events, self._operator, self._state, features, accepted)
         if not self.encoder.further:
-            return features, accepted
-        every = np.zeros((len(events), self.encoder.n_features), np.float32)
-        every[:, : features.shape[1]] = features
-        for place, scale in self._further:
-            every[:, place] = scale.trace(events)[0]
-        return every, accepted
+            return trace_events(events, self._operator, self._state, weights, keep_features=keep_features)
+        first = trace_events(events, self._operator, self._state, None)
+        scales = [(place, scale.trace(events)) for place, scale in self._further]
+        return joined(first, scales, self.encoder.n_features, weights, keep_features=keep_features)
 
     @one_thread
     def prepare(self, columns: int) -> bool:
@@ -267,9 +262,10 @@ class Engine(Shown):
         plane = state.clock[CLOCK_PLANE]
         rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
         codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
+        worth = 1 / operator.unit if operator.scales is None else operator.scales
         for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
             encode_volume(projection, moments, atoms, False, 0, operator, state)
-            code[:] = state.code[0, 0, : operator.n_filters] / operator.unit
+            code[:] = (state.code[0, 0] * worth)[: operator.n_filters]
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
     @one_thread

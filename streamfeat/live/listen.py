@@ -132,7 +132,7 @@ class ListenJob:
         self._learn_online, self._network, self._publish = learn_online, network, publish
         self._engine_of, self._tap, self._threads = engine_of, tap, usable_threads(threads)
         self._patience_ns = patience_s * 1e9
-        self.interrupted = False
+        self.interrupted, self._keep_features = False, True
         self._warnings = Warnings.on(console)
         self._inbox = Inbox(max_delay_s=max_delay_s)
         window_us = self._encoder.geometry.window_us
@@ -158,7 +158,7 @@ class ListenJob:
         with ExitStack() as opened:
             if self._state:
                 _hold(self._state, opened)
-            warm_up(self._encoder, self._policy, decoders=True)
+            warm_up(self._encoder, self._policy, self._classifier, decoders=True)
             session = opened.enter_context(self._network.open())
             if self._address:
                 opened.callback(self.health.stop_serving)
@@ -200,6 +200,7 @@ class ListenJob:
         """
         console = outputs.console
         labels = self._classifier.labels if self._classifier else ()
+        self._keep_features = self._publish or outputs.reads_features(has_classifier=bool(labels))
         with ExitStack() as held:
 
             def sinks() -> Sequence[Sink[Emission]]:
@@ -244,6 +245,7 @@ class ListenJob:
             engine=self._engine_of(topic),
             denoising=self._denoising,
             load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
+            keep_features=self._keep_features,
             threads=self._threads,
         )
 

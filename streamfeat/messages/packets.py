@@ -13,6 +13,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.json_fields import Fields
+from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.codecs import (
     EVT3_WRAP_US,
@@ -32,6 +33,7 @@ __all__ = [
     "MAX_PIXELS",
     "MAX_STREAM_US",
     "Content",
+    "Item",
     "Label",
     "Packet",
     "PacketReader",
@@ -124,6 +126,10 @@ class Label:
         return cls(start_us, duration_us, m.label, m.split, m.source, topic)
 
 
+Item = Packet | Label
+"""What comes out of a timeline."""
+
+
 class PacketReader:
     """Decodes the event messages of one topic; keeps what decoders carry from one message to the next.
 
@@ -134,6 +140,8 @@ class PacketReader:
         encoding: of the latest message.
         resolution: `(height, width)` of the latest message that could be decoded; None before it.
         time_us: the time that the latest message gave for itself; None where it has none.
+        n_inside: how many events of the latest message are on the sensor.
+        span: `(2,)` int64, their earliest and latest time; as it was where there are none.
     """
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -141,6 +149,8 @@ class PacketReader:
         self.encoding = ""
         self.resolution: Resolution | None = None
         self.time_us: int | None = None
+        self.n_inside = 0
+        self.span = np.zeros(2, np.int64)
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
@@ -163,6 +173,7 @@ class PacketReader:
         if isinstance(content, EventArray):
             self.resolution = _resolution(content.height, content.width)
             self.encoding, self.time_us = schema.partition("/")[0], None
+            self.n_inside = time_span(content.events, *self.resolution, self.span)
             return content.events
         if self._last_seq is not None and content.seq > self._last_seq + 1:
             self.resync()
@@ -173,7 +184,8 @@ class PacketReader:
         decoder = self._decoders.get(content.encoding)
         if decoder is None:
             decoder = self._decoders[content.encoding] = make_decoder(content.encoding, self._max_events)
-        events = decoder.decode(content.events, content.time_base)
+        events = decoder.decode(content.events, content.time_base, resolution)
+        self.n_inside, self.span = decoder.n_inside, decoder.span
         if isinstance(decoder, Evt3Decoder) and len(events):
             self._place(decoder, events, content.stamp_ns)
         self.encoding, self.resolution = content.encoding, resolution
@@ -222,6 +234,7 @@ class PacketReader:
             if 0 < wraps <= _MOST_WRAPS:
                 decoder.count_wraps(wraps)
                 events["t"] += wraps * EVT3_WRAP_US
+                decoder.span += wraps * EVT3_WRAP_US
         self._is_broken = False
         self._before = stamp_ns, int(events["t"][-1])
 
