@@ -108,6 +108,8 @@ class _Camera:
     def step(self) -> None:
         """Send a packet, or what becomes of it."""
         fault = self._fault() if self.seq > 3 else ""
+        if self.held and fault in ("swapped", "lost"):
+            fault = ""  # one at a time, or the packet that is held would be lost, too
         self.said[fault or "sound"] += 1
         if fault == "jump":
             self.time_us += int(self.rng.integers(100_000_000, 300_000_000))
