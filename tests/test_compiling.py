@@ -13,6 +13,8 @@ from streamfeat.kernels import cache
 from streamfeat.stream import compiling
 
 LEFT = """
+import sys
+
 from numba.core import event
 
 compiled = []
@@ -30,11 +32,14 @@ from streamfeat.stream.compiling import compile_together, is_compiled
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.warming import warm_up
 
-assert not is_compiled()
-compile_together()
-assert is_compiled()
+narrow = sys.argv[1] == "narrow"
+assert not is_compiled(narrow=narrow)
+compile_together(narrow=narrow)
+assert is_compiled(narrow=narrow)
 event.register("numba:compile", Heard())
-encoder = random_encoder(0, Geometry(patch=6, n_bins=2, bin_us=5_000), 5, encoding="triangle")
+encoding = "soft" if narrow else "triangle"
+encoder = random_encoder(0, Geometry(patch=6, n_bins=2, bin_us=5_000), 5, encoding=encoding, narrow=narrow)
+assert encoder.is_narrow == narrow
 warm_up(encoder, EmitPolicy.parse("10ms"))
 print(*compiled)
 """
@@ -48,9 +53,10 @@ def empty(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
-def test_nothing_is_left_to_compile(tmp_path):
+@pytest.mark.parametrize("state", ["narrow", "wide"])
+def test_nothing_is_left_to_compile(tmp_path, state):
     done = subprocess.run(
-        [sys.executable, "-c", LEFT],
+        [sys.executable, "-c", LEFT, state],
         env=os.environ
         | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(streamfeat.__file__).parent.parent)},
         capture_output=True,
@@ -64,7 +70,7 @@ def test_nothing_is_left_to_compile(tmp_path):
 
 @pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
 def test_the_processes_end_when_they_are_told(empty):
-    with compiling.Compilers() as compilers:
+    with compiling.Compilers(narrow=False) as compilers:
         assert compilers.is_alive()
         processes = list(compilers._started)
         assert len(processes) == 2
@@ -94,8 +100,37 @@ def test_a_half_does_not_wait_for_one_that_is_gone(empty, monkeypatch):
         return process
 
     monkeypatch.setattr(compiling.Compilers, "_start", start)
-    compiling.compile_together()
+    compiling.compile_together(narrow=False)
     assert [process.returncode for process in started] == [-6, 0]
+
+
+def test_of_two_commands_one_compiles_and_the_other_waits_for_it(empty, monkeypatch):
+    monkeypatch.setattr(compiling, "_cores", lambda: 2)
+    monkeypatch.setattr(
+        compiling.Compilers,
+        "_start",
+        lambda self, half, stdin=None, stdout=None: (
+            self._started.append(process := subprocess.Popen(["sleep", "60"], stdin=stdin, stdout=stdout))
+            or process
+        ),
+    )
+    with compiling.Compilers(narrow=False) as second:
+        second.close()
+    with compiling.Compilers(narrow=False) as first:
+        second = compiling.Compilers(narrow=False)
+        other_state = compiling.Compilers(narrow=True)
+        assert (len(first._started), len(second._started), len(other_state._started)) == (2, 0, 2)
+        assert first.is_alive()
+        assert second.is_alive()
+        other_state.close()
+        first.close()  # killed before it was done: whoever waits goes on with it
+        assert second.is_alive()
+        assert len(second._started) == 2
+        third = compiling.Compilers(narrow=False)
+        monkeypatch.setattr(third, "_until_s", 0)
+        assert not third.is_alive()
+        third.close()
+        second.close()
 
 
 @pytest.mark.parametrize("reason", ["compiled", "one core", "no interpreter", "no room for a process"])
@@ -110,7 +145,7 @@ def test_no_process_where_it_would_be_of_no_use(empty, monkeypatch, reason):
         monkeypatch.setattr(sys, "executable", "")
     elif reason == "no room for a process":
         monkeypatch.setattr(subprocess, "Popen", refuse)
-    with compiling.Compilers() as compilers:
+    with compiling.Compilers(narrow=False) as compilers:
         assert not compilers.is_alive()
         compilers.wait()
 
@@ -130,7 +165,7 @@ def test_a_pipe_is_told_why_nothing_comes(run, tmp_path, monkeypatch, command):
     monkeypatch.setattr(compiling, "_cores", lambda: 1)  # nothing is started
     told = {}
     for compiled in (True, False):
-        monkeypatch.setattr(compiling, "is_compiled", lambda compiled=compiled: compiled)
+        monkeypatch.setattr(compiling, "is_compiled", lambda narrow, compiled=compiled: compiled)
         told[compiled] = run(*line)
         assert told[compiled].status == 0, told[compiled].err
     assert "compiling" not in told[True].err

@@ -188,7 +188,7 @@ def evaluate(
             print_assumptions(data.assumptions)
             report("reading labels", 1, 1, "")
             if not WITHOUT_KERNELS.issuperset(methods):
-                compile_first(quiet=quiet)
+                compile_first([True], quiet=quiet)
             result = run(
                 data,
                 plan_cells(methods, base, parsed, data.n_folds),

@@ -273,7 +273,7 @@ def train(
                     f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
                     "or write them with `streamfeat convert`"
                 )
-        compile_first(quiet=quiet)
+        compile_first([encoder.is_narrow], quiet=quiet)
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)

@@ -121,7 +121,7 @@ def latency(
         methods=methods or (),
     )
     print_assumptions(report.assumptions)
-    compile_first(quiet=quiet)
+    compile_first(report.states, quiet=quiet)
     try:
         with progress_bars(from_a_thread=False, quiet=quiet, as_lines=verbose) as progress:
             progress("compiling", 0, 0, "not counted")

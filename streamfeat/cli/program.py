@@ -7,7 +7,7 @@ Not here: the commands.
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -239,19 +239,25 @@ def model_or_general(model: Path | None) -> Path:
     return model or GENERAL_MODEL
 
 
-def compile_first(*, quiet: bool) -> None:
-    """Compile the kernels that every encoder needs, on two cores; nothing where that was done before."""
+def compile_first(states: Iterable[bool], *, quiet: bool) -> None:
+    """Compile the kernels that every encoder needs, on two cores; nothing where that was done before.
+
+    Args:
+        states: of the encoders, True for the narrow one.
+        quiet: say nothing.
+    """
     from streamfeat.stream.compiling import compile_together
 
     tell_compiling(quiet=quiet)
-    compile_together()
+    for narrow in sorted(set(states)):
+        compile_together(narrow=narrow)
 
 
 def tell_compiling(*, quiet: bool) -> None:
     """Say why nothing else is said for half a minute, where kernels were not compiled before."""
     from streamfeat.stream.compiling import is_compiled
 
-    if not quiet and not is_compiled():
+    if not quiet and not (is_compiled(narrow=True) or is_compiled(narrow=False)):
         err.print(
             "[dim]compiling:[/] kernels, once for this version; it takes half a minute or more",
             soft_wrap=True,

@@ -150,16 +150,22 @@ class LatencyReport:
         self.steal: float | None = None
         self.preemptions = 0
 
+    @property
+    def states(self) -> list[bool]:
+        """Of each model, whether its engines have the narrow state."""
+        return [model.encoder.is_narrow for model in self._models]
+
     def compile(self) -> None:
         """Let numba compile what `run` will call, and measure what reading the clock costs."""
         packet = next(item for item in self._items if isinstance(item, Packet) and len(item.events))
-        first, encoder = packet.events[:1].copy(), self._models[0].encoder
-        engine = Engine(encoder, packet.resolution, look_ahead=self._look_ahead)
-        engine.feed(first)
-        engine.follow(first)
-        follow_timed(engine, first)
-        engine.advance(int(first["t"][0]) + encoder.geometry.window_us)
-        engine.features()
+        first = packet.events[:1].copy()
+        for model in self._models:
+            engine = Engine(model.encoder, packet.resolution, look_ahead=self._look_ahead)
+            engine.feed(first)
+            engine.follow(first)
+            follow_timed(engine, first)
+            engine.advance(int(first["t"][0]) + model.encoder.geometry.window_us)
+            engine.features()
         for method in self._methods:
             walk_method(method, [replace(packet, events=first)], warm_up=0, goes=lambda done: True)
         self.clock_ns, self.python_clock_ns = clock_cost_ns(), python_clock_cost_ns()

@@ -7,8 +7,8 @@ numba compiles one kernel at a time in a process, whatever its threads. Kernels 
 the same work: codes of a window, and following the counts. The second half needs the first at its end, and
 waits for it.
 
-Each process is a `python -m streamfeat.stream.compiling HALF`: multiprocessing would run a program that calls
-`sf.replay` once more.
+Each process is a `python -m streamfeat.stream.compiling HALF STATE`: multiprocessing would run a program that
+calls `sf.replay` once more. Of several commands that start at once one compiles, and the others wait for it.
 """
 
 import os
@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 import numpy as np
 
@@ -26,7 +26,9 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.engine.state import allocate_state
+from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.files.outputs import locked_file
 from streamfeat.kernels import cache
 from streamfeat.kernels.ingest import count_events
 from streamfeat.kernels.planes import look_ahead
@@ -35,28 +37,48 @@ from streamfeat.kernels.update import mark_dirty, read, renew, settle
 __all__ = ["Compilers", "compile_together", "is_compiled"]
 
 _TURN_S = 0.05
+_PATIENCE_S = 300
+"""After so long a command compiles by itself, and waits for no other: that one may be stopped."""
+
 _FIRST, _ALONE = 0, 1
 
 
-def is_compiled() -> bool:
-    """Whether the last kernel that the halves compile is in the cache, or nothing can be kept there."""
-    source, folder = getattr(read, "py_func", None), cache.folder()
-    if source is None or folder is None:  # numba is switched off, or all folders are read-only
-        return True
-    name = f"{Path(source.__code__.co_filename).stem}.{source.__name__}-*.nbi"
-    return any(folder.glob(name))
+def is_compiled(*, narrow: bool) -> bool:
+    """Whether the kernels of a state are in the cache, or nothing can be kept there.
+
+    Args:
+        narrow: the narrow state of engines, or the wide one.
+    """
+    mark = _mark(narrow)
+    return mark is None or mark.exists()
 
 
 class Compilers:
-    """Two processes that compile; a context manager, which ends them.
+    """Two processes that compile, or those of another command; a context manager, which ends its own.
 
     On a single core it is none: two would do parts of their work twice. They get no SIGINT from the terminal.
+
+    Args:
+        narrow: which state of engines to compile for.
     """
 
-    def __init__(self) -> None:
-        """Start them, if there is something to compile."""
+    def __init__(self, *, narrow: bool) -> None:
+        """Start them, if there is something to compile and no other command does."""
+        self._narrow, self._until_s = narrow, time.monotonic() + _PATIENCE_S
         self._started: list[subprocess.Popen[bytes]] = []
-        if is_compiled() or _cores() < 2 or not sys.executable:
+        self._lock: BinaryIO | None = None
+        self._others_compile = False
+        self._begin()
+
+    def _begin(self) -> None:
+        mark = _mark(self._narrow)
+        self._others_compile = False
+        if mark is None or mark.exists() or _cores() < 2 or not sys.executable:
+            return
+        try:
+            self._lock = locked_file(mark.with_suffix(".lock"))
+        except InputError:
+            self._others_compile = True
             return
         try:
             codes = self._start("codes", stdout=subprocess.PIPE)
@@ -67,7 +89,7 @@ class Compilers:
             self.close()
 
     def _start(self, half: str, stdin: object = None, stdout: object = None) -> "subprocess.Popen[bytes]":
-        command = [sys.executable, "-P", "-m", __name__, half]
+        command = [sys.executable, "-P", "-m", __name__, half, "narrow" if self._narrow else "wide"]
         path = os.pathsep.join(place for place in sys.path if place)
         started = subprocess.Popen(  # type: ignore[call-overload]
             command,
@@ -91,8 +113,11 @@ class Compilers:
         self.close()
 
     def is_alive(self) -> bool:
-        """Whether one of them still compiles."""
-        return any(process.poll() is None for process in self._started)
+        """Whether one of them, or of those of another command, still compiles."""
+        if self._others_compile:
+            self._begin()
+            self._others_compile &= time.monotonic() < self._until_s
+        return self._others_compile or any(process.poll() is None for process in self._started)
 
     def wait(self, goes_on: Callable[[], bool] = lambda: True) -> None:
         """Wait until both are done, or something else is."""
@@ -105,37 +130,69 @@ class Compilers:
             process.kill()
             process.wait()
         self._started.clear()
+        self._others_compile = False
+        if self._lock:
+            self._lock.close()
 
 
-def compile_together() -> None:
-    """Fill the cache, in about two thirds of the time that one process takes; nothing where it is filled."""
-    with Compilers() as compilers:
+def compile_together(*, narrow: bool) -> None:
+    """Fill the cache, in about two thirds of the time that one process takes; nothing where it is filled.
+
+    Args:
+        narrow: see `Compilers`.
+    """
+    with Compilers(narrow=narrow) as compilers:
         compilers.wait()
+    mark = _mark(narrow)
+    if mark and not mark.exists() and _cores() < 2:
+        for half in ("codes", "counts"):
+            _compile(half, narrow=narrow)
+        mark.touch()
+
+
+def _mark(narrow: bool) -> Path | None:
+    """The file that is there once the kernels of a state are; None where nothing can be kept."""
+    folder = cache.folder() if hasattr(read, "py_func") else None  # it has none if numba is switched off
+    return folder / f"compiled-{'narrow' if narrow else 'wide'}" if folder else None
 
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _compile(half: str) -> None:
-    """Compile one half."""
+def _compile(half: str, *, narrow: bool, told: Callable[[], object] = lambda: None) -> None:
+    """Compile one half; `told` is called where the second one needs what the first has compiled."""
     # Kernels are compiled for types, not for values.
-    encoder = random_encoder(0, Geometry(patch=4, n_bins=1, bin_us=1_000), 2, encoding="split")
+    geometry = Geometry(patch=4, n_bins=1, bin_us=1_000)
+    encoder = random_encoder(0, geometry, 2, encoding="split", narrow=narrow)
+    assert encoder.is_narrow == narrow
     event, resolution = make_events([0], [0], [1], [0]), (4, 4)
     operator = with_fixed_point(encoder.operator, encoder.geometry.grid_shape(resolution))
     state = allocate_state(encoder.geometry, operator, resolution, origin_us=0, planes=1, threads=1)
     if half == "codes":
         encoder.encode(event, resolution)
-        os.close(sys.stdout.fileno())  # tells the other process
+        told()
         look_ahead(0, 0, 0, operator, state)
         return
     count_events(event, operator, state)
     mark_dirty(operator, state)
     renew(_FIRST, _ALONE, operator, state)
     settle(state)
-    sys.stdin.buffer.read()  # what codes are made with is in the cache, or the other process is gone
+    told()
     read(operator, state, np.empty(n_features(encoder.operator), np.float32))
 
 
+def _main(half: str, state: str) -> None:
+    """One of the two processes: the first tells the second by the end of its output."""
+    narrow = state == "narrow"
+    if half == "codes":
+        _compile(half, narrow=narrow, told=lambda: os.close(sys.stdout.fileno()))
+        return
+    _compile(half, narrow=narrow, told=sys.stdin.buffer.read)
+    mark = _mark(narrow)
+    if mark:
+        mark.touch()
+
+
 if __name__ == "__main__":
-    _compile(sys.argv[1])
+    _main(*sys.argv[1:])

@@ -30,7 +30,7 @@ def warm_up(
         classifier: that they predict with.
         decoders: compile those of live payloads, too.
     """
-    compile_together()
+    compile_together(narrow=encoder.is_narrow)
     event = make_events([0], [0], [1], [0])
     if decoders:
         for encoding in PAYLOAD_ENCODINGS:
