@@ -303,12 +303,12 @@ def test_a_file_carries_every_scale(tmp_path):
     assert first.fingerprint not in (BOTH.fingerprint, BOTH.scales[1].fingerprint)
     first.save(tmp_path / "one")
     # The file of one scale is what it was.
-    assert read_safetensors(tmp_path / "one", "streamfeat-encoder", 1)[1]["format"] == "streamfeat-encoder"
+    assert read_safetensors(tmp_path / "one", "streamfeat-encoder", 1, 2)[1]["format"] == "streamfeat-encoder"
 
 
 def test_a_damaged_file_of_scales_is_refused_in_one_line(tmp_path):
     BOTH.save(tmp_path / "both")
-    arrays, header = read_safetensors(tmp_path / "both", "streamfeat-scales", 1)
+    arrays, header = read_safetensors(tmp_path / "both", "streamfeat-scales", 1, 2)
     scales = header["scales"]
     for bad_arrays, bad_header in (
         (arrays, {"scales": None}),
@@ -320,7 +320,7 @@ def test_a_damaged_file_of_scales_is_refused_in_one_line(tmp_path):
         (arrays, {"scales": scales[::-1]}),
         ({k: v * np.nan if k == "1.filters" else v for k, v in arrays.items()}, {"scales": scales}),
     ):
-        write_safetensors(tmp_path / "bad", "streamfeat-scales", 1, bad_arrays, bad_header)
+        write_safetensors(tmp_path / "bad", "streamfeat-scales", 2, bad_arrays, bad_header)
         with pytest.raises(InputError) as caught:
             Encoder.load(tmp_path / "bad")
         assert "not a usable model" in str(caught.value)

@@ -267,12 +267,13 @@ class Encoder(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file; the file appears whole or not at all."""
-        version = NARROW_VERSION if any(scale.is_narrow for scale in self.scales) else WIDE_VERSION
+        versions = [NARROW_VERSION if scale.is_narrow else WIDE_VERSION for scale in self.scales]
         if self.further:
-            parts = joined_parts([scale._parts() for scale in self.scales])
-            write_safetensors(Path(path), _SCALES_KIND, version, *parts)
+            parts = [scale._parts() for scale in self.scales]
+            each = [(one[0], one[1] | {"version": v}) for one, v in zip(parts, versions, strict=True)]
+            write_safetensors(Path(path), _SCALES_KIND, max(versions), *joined_parts(each))
         else:
-            write_safetensors(Path(path), _KIND, version, *self._parts())
+            write_safetensors(Path(path), _KIND, versions[0], *self._parts())
 
     def _parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Arrays and header of the first scale."""
