@@ -97,7 +97,7 @@ def test_a_projection_fits_into_16_bits_and_a_code_into_its_part_whatever_the_vo
     [
         (("inverse", "soft"), GEOMETRY, "32 bits"),
         (("direct", "triangle"), GEOMETRY, "32 bits"),
-        (("direct", "soft"), Geometry(patch=8, stride=3, n_bins=3, bin_us=1000, max_count=100), "1.2 steps"),
+        (("direct", "soft"), Geometry(patch=8, stride=3, n_bins=3, bin_us=1000, max_count=100), "1.2 levels"),
         (("direct", "soft"), Geometry(patch=12, stride=3, n_bins=3, bin_us=1000, max_count=9), "off by"),
     ],
 )
@@ -125,10 +125,10 @@ def test_a_file_of_the_narrow_state_has_a_version_of_its_own_and_comes_back_whol
     ("name", "damage", "message"),
     [
         ("columns", lambda a: np.minimum(a.astype(int) * 3, 32767).astype(np.int16), r"below 2\^15"),
-        ("scales", lambda a: -a, "above zero"),
-        ("scales", lambda a: a * np.nan, "above zero"),
-        ("scales", lambda a: a[:5], "scales is"),
-        ("scales", lambda a: a.astype(np.float32), "scales is"),
+        ("steps", lambda a: -a, "above zero"),
+        ("steps", lambda a: a * np.nan, "above zero"),
+        ("steps", lambda a: a[:5], "steps is"),
+        ("steps", lambda a: a.astype(np.float32), "steps is"),
     ],
 )
 def test_a_file_whose_sums_could_overflow_is_refused_with_the_arithmetic(name, damage, message, tmp_path):

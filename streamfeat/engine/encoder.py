@@ -28,7 +28,7 @@ from streamfeat.report.shown import Shown
 __all__ = ["NARROW_VERSION", "WIDE_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
 
 WIDE_VERSION, NARROW_VERSION = 1, 2
-"""Format versions of files: what a version 1 holds, and a version 2 the scales of filters as well."""
+"""Format versions of files: the second holds what the first does, and the steps of the narrow state."""
 
 _KIND = "streamfeat-encoder"
 _SCALES_KIND = "streamfeat-scales"
@@ -144,7 +144,7 @@ class Encoder(Shown):
     ) -> Self:
         """Fold whitening and mean removal into one operator and quantise it.
 
-        In the wide state one scale serves all filters: an entry of the operator is off by at most
+        In the wide state one step serves all filters: an entry of the operator is off by at most
         `max |P| / 65534`, so a code is off by about 1e-4 of the largest. In the narrow state each filter has
         its own, so that sums of 16 bits cannot overflow: a code is off by about 1e-3 of the largest, the
         engine takes half the memory, and an event half the time.
@@ -206,8 +206,10 @@ class Encoder(Shown):
         """SHA-256 over everything that decides what features are."""
         digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
         for name, value in zip(Operator._fields, self.operator, strict=True):
-            if name in ("shape", "wide", "upper", "lower", "gain") or (name == "scales" and value is None):
-                continue  # of the sensor, or of the narrow state alone
+            if name in ("shape", "packed", "wide", "upper", "lower", "gain"):
+                continue  # of the sensor, columns again, or of the narrow state alone
+            if name == "steps" and value is None:
+                continue  # of the narrow state, too
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
         for scale in self.further:
             digest.update(scale.fingerprint.encode())
@@ -215,8 +217,8 @@ class Encoder(Shown):
 
     @property
     def is_narrow(self) -> bool:
-        """Whether engines keep projections in 16 bits, and not in 32."""
-        return self.operator.scales is not None
+        """Whether engines keep projections in 16 bits, and not in 32; of the first scale."""
+        return self.operator.steps is not None
 
     @property
     def n_filters(self) -> int:
@@ -313,7 +315,7 @@ class Encoder(Shown):
         if not all(math.isfinite(value) for value in scalars.values()):
             raise InputError("a scalar is not finite")
         fields = fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
-        narrow = header["version"] == NARROW_VERSION
+        narrow = "steps" in arrays
         stored, fields["wide"] = _stored_arrays(narrow=narrow), None if narrow else True
         operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in stored})
         provenance = header.get("provenance", {})
@@ -334,7 +336,7 @@ class Encoder(Shown):
 
 def _stored_arrays(*, narrow: bool) -> tuple[str, ...]:
     arrays = ("columns", "offset", "quadratic", "linear", "square_norms")
-    return (*arrays, "scales") if narrow else arrays
+    return (*arrays, "steps") if narrow else arrays
 
 
 _STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "reach", "gap")

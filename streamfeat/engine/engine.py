@@ -262,7 +262,7 @@ class Engine(Shown):
         plane = state.clock[CLOCK_PLANE]
         rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
         codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
-        worth = 1 / operator.unit if operator.scales is None else operator.scales
+        worth = 1 / operator.unit if operator.steps is None else operator.steps
         for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
             encode_volume(projection, moments, atoms, False, 0, operator, state)
             code[:] = (state.code[0, 0] * worth)[: operator.n_filters]

@@ -1,6 +1,6 @@
 """Making and checking the integers of the narrow state: projections and codes of 16 bits.
 
-Lives here: a scale for each filter such that no sum can overflow, and the fixed point of codes of 16 bits.
+Lives here: a step for each filter such that no sum can overflow, and the fixed point of codes of 16 bits.
 Not here: the wide state (`operator`), and what kernels do with the integers (`kernels.narrow`).
 """
 
@@ -28,9 +28,9 @@ FEWEST_CODES = 1 << 8
 def narrow_columns(
     geometry: Geometry, projector: NDArray[np.float64], padded: int
 ) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
-    """Quantise a projector with a scale for each filter, so that a projection fits into 16 bits.
+    """Quantise a projector with a step for each filter, so that a projection fits into 16 bits.
 
-    A scale is such that `max_count` times the sum of a filter's integers stays below 2^15 after rounding; and
+    A step is such that `max_count` times the sum of a filter's integers stays below 2^15 after rounding; and
     that the codes of a filter of few large entries are at most twice as long as those of a flat one, for all
     codes share a gain.
 
@@ -40,7 +40,7 @@ def narrow_columns(
         padded: filters after padding.
 
     Returns:
-        columns `(d, Kp)` and scales `(Kp,)`.
+        columns `(d, Kp)` and steps `(Kp,)`.
 
     Raises:
         InputError: the integers would be too coarse, with the arithmetic.
@@ -48,37 +48,37 @@ def narrow_columns(
     k, d = projector.shape
     most, room = geometry.max_count, _INT16 - geometry.max_count * d / 2
     sums, lengths = np.abs(projector).sum(axis=1), np.sqrt(np.square(projector).sum(axis=1) * d)
-    scales = np.ones(padded)
+    steps = np.ones(padded)
     if room > 0:
-        scales[:k] = np.maximum(sums / room, lengths / (2 * room)) * most
-        scales[scales == 0] = 1.0
+        steps[:k] = np.maximum(sums / room, lengths / (2 * room)) * most
+        steps[steps == 0] = 1.0
     # A number that is rounded is off by 1/sqrt(12) of a step: entries, of which `d` are added, and a code and
-    # its bound, whose steps are up to 8 scales.
-    error = scales[:k].max() * math.sqrt(d / 12 + 8**2 / (6 * most**2))
+    # its bound, whose units are up to 8 steps.
+    error = steps[:k].max() * math.sqrt(d / 12 + 8**2 / (6 * most**2))
     largest = lengths.max() or 1.0
     if room <= 0 or error > COARSEST * largest:
         raise InputError(
-            f"a sum of {d} entries of up to {most} in 16 bits leaves {max(room, 0) / (most * d):.1f} steps "
+            f"a sum of {d} entries of up to {most} in 16 bits leaves {max(room, 0) / (most * d):.1f} levels "
             f"for an entry of a filter: codes would be off by {error / largest:.1e} of the largest, "
             f"{COARSEST:.0e} is allowed"
         )
     columns = np.zeros((d, padded), np.int16)
-    columns[:, :k] = np.rint(projector.T / scales[:k])
-    return columns, scales
+    columns[:, :k] = np.rint(projector.T / steps[:k])
+    return columns, steps
 
 
 def check_narrow(geometry: Geometry, operator: Operator) -> None:
-    """Refuse scales that are none, and sums that could overflow 16 bits.
+    """Refuse steps that are none, and sums that could overflow 16 bits.
 
     Raises:
         InputError: with the arithmetic.
     """
-    scales, padded = operator.scales, operator.columns.shape[1]
-    assert scales is not None
-    if scales.dtype != np.float64 or scales.shape != (padded,):
-        raise InputError(f"scales is {scales.dtype} {scales.shape}, expected float64 ({padded},)")
-    if not ((scales > 0).all() and np.isfinite(scales).all()):
-        raise InputError("scales must be finite and above zero")
+    steps, padded = operator.steps, operator.columns.shape[1]
+    assert steps is not None
+    if steps.dtype != np.float64 or steps.shape != (padded,):
+        raise InputError(f"steps is {steps.dtype} {steps.shape}, expected float64 ({padded},)")
+    if not ((steps > 0).all() and np.isfinite(steps).all()):
+        raise InputError("steps must be finite and above zero")
     sums = geometry.max_count * int(np.abs(operator.columns.astype(np.int64)).sum(axis=0).max())
     if sums > _INT16:
         raise InputError(
@@ -90,16 +90,16 @@ def check_narrow(geometry: Geometry, operator: Operator) -> None:
 
 
 def largest_code(operator: Operator) -> float:
-    """What no code exceeds, in units of the scale of its filter; before the threshold.
+    """What no code exceeds, in units of the step of its filter; before the threshold.
 
     With `v = (v - m) + m`: `|Q v| <= |Q| |v - m| + |sum Q| |m|`, and sigma is at least `|v - m| / sqrt(d)`
     and at least the square root of eps. No float is summed, so that every processor finds the same.
     """
-    columns, scales = operator.columns.astype(np.int64), operator.scales
-    assert scales is not None
+    columns, steps = operator.columns.astype(np.int64), operator.steps
+    assert steps is not None
     lengths = np.sqrt(np.square(columns).sum(axis=0) * len(columns))
     leak = np.abs(columns.sum(axis=0)) * (operator.max_count / math.sqrt(operator.eps))
-    return float((lengths + leak + np.abs(operator.offset / scales)).max())
+    return float((lengths + leak + np.abs(operator.offset / steps)).max())
 
 
 def with_narrow_codes(operator: Operator, volumes: int) -> Operator:
@@ -119,15 +119,15 @@ def with_narrow_codes(operator: Operator, volumes: int) -> Operator:
             f"their sum, {FEWEST_CODES} are needed; raise the stride or the downsample"
         )
     gain = (most - 2) / max(largest, 1.0)
-    assert operator.scales is not None
-    units = gain / operator.scales
+    assert operator.steps is not None
+    units = gain / operator.steps
     # A product is rounded down, by half a unit in the mean.
     upper, lower = (
         np.rint((operator.offset + sign * operator.threshold) * units - 0.5) + 2**15 for sign in (1, -1)
     )
-    scales = operator.scales / gain
+    steps = operator.steps / gain
     bounds = [bound.clip(0, 2**16 - 1).astype(np.uint16) for bound in (upper, lower)]
     for bound in bounds:
         bound.flags.writeable = False
-    scales.flags.writeable = False
-    return operator._replace(gain=gain, scales=scales, upper=bounds[0], lower=bounds[1])
+    steps.flags.writeable = False
+    return operator._replace(gain=gain, steps=steps, upper=bounds[0], lower=bounds[1])

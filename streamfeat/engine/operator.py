@@ -46,6 +46,7 @@ def fixed_fields(
         "unit": 1.0,
         "largest": math.inf,
         "threshold": float(np.float32(threshold)),
+        "packed": np.zeros((0, 0, 0), np.int16),
         "gram": (atoms @ atoms.T).astype(np.float32) if inverse else np.zeros((0, 0), np.float32),
     }
 
@@ -85,14 +86,14 @@ def quantise(
     offset = projector @ mean
     # Mean removal: P (I - 1 1'/d).
     projector -= projector.mean(axis=1, keepdims=True)
-    scale, scales = float(np.abs(projector).max()) / _INT16 or 1.0, None
+    scale, steps = float(np.abs(projector).max()) / _INT16 or 1.0, None
     columns = np.zeros((d, padded), np.int16)
     columns[:, :k] = np.rint(projector.T / scale)
     if narrow:
         if fixed["inverse"] or fixed["kind"] == TRIANGLE:
             raise InputError("codes of the inverse formulation and of the triangle encoding need 32 bits")
         scale = 1.0
-        columns, scales = narrow_columns(geometry, projector, padded)
+        columns, steps = narrow_columns(geometry, projector, padded)
     padded_offset = np.zeros(padded, np.float32)
     padded_offset[:k] = offset
     square_norms = np.zeros(padded, np.float32)
@@ -129,7 +130,7 @@ def quantise(
         square_norms=square_norms,
         gap=float(gap),
         wide=None if narrow else True,
-        scales=scales,
+        steps=steps,
     )
 
 
@@ -174,7 +175,7 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
         raise InputError("offset and square_norms must be finite")
     if form[0]:
         _check_form(geometry, operator)
-    if operator.scales is not None:
+    if operator.steps is not None:
         if form[0]:
             raise InputError("only soft codes of the direct formulation have a narrow state")
         check_narrow(geometry, operator)
@@ -188,11 +189,23 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
         )
     columns = aligned_zeros(operator.columns.shape, np.int16)
     columns[:] = operator.columns
-    if operator.scales is not None:
-        return operator._replace(columns=columns)
-    checked = operator._replace(largest=_largest_code(operator), columns=columns)
+    packed = operator.packed if form[0] else _in_pairs(columns)
+    checked = operator._replace(columns=columns, packed=packed)
+    if operator.steps is not None:
+        return checked
+    checked = checked._replace(largest=_largest_code(checked))
     _fixed_point_bits(checked, 1)
     return checked
+
+
+def _in_pairs(columns: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Columns `(d, Kp)` as `Operator.packed` holds them; a column of zeros is added to an odd number."""
+    (d, width), pairs = columns.shape, -(-len(columns) // 2)
+    padded = np.zeros((2 * pairs, width), np.int16)
+    padded[:d] = columns
+    packed = aligned_zeros((width // LANES, pairs, 2 * LANES), np.int16)
+    packed.reshape(-1, pairs, LANES, 2)[:] = padded.reshape(pairs, 2, -1, LANES).transpose(2, 0, 3, 1)
+    return packed
 
 
 def _check_form(geometry: Geometry, operator: Operator) -> None:
@@ -236,7 +249,7 @@ def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operato
     """
     rows, columns = grid_shape
     volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling)
-    if operator.scales is not None:
+    if operator.steps is not None:
         return with_narrow_codes(operator, volumes)._replace(shape=grid_shape)
     unit = 2.0 ** _fixed_point_bits(operator, volumes)
     offset = operator.offset * np.float32(unit)

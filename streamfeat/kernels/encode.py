@@ -156,7 +156,7 @@ def read_cell(cell: int, operator: Operator, state: State, features: NDArray[np.
     """
     pooled, size = state.pooled[state.clock[CLOCK_PLANE]], features.shape[0] // state.pooled.shape[1]
     own, place = pooled[cell : cell + 1], features[cell * size : (cell + 1) * size]
-    write_features(operator.scales, operator.wide, operator, own, place)
+    write_features(operator.steps, operator.wide, operator, own, place)
 
 
 @kernel
@@ -169,12 +169,12 @@ def read_features(operator: Operator, state: State, features: NDArray[np.float32
         features: `(cells * K,)`, or `(cells * 2 K,)` for SPLIT, in each cell positive parts before negative
             ones; overwritten.
     """
-    write_features(operator.scales, operator.wide, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
+    write_features(operator.steps, operator.wide, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
 
 
 @inlined
 def write_features(
-    scales: NDArray[np.float64] | None,
+    steps: NDArray[np.float64] | None,
     wide: bool | None,
     operator: Operator,
     pooled: NDArray[np.int32],
@@ -183,7 +183,7 @@ def write_features(
     """Write pooled sums of the cells as floats.
 
     Args:
-        scales: of the operator.
+        steps: of the operator.
         wide: of the operator (see `write_code`).
         operator: number of filters, encoding and fixed point.
         pooled: `(cells, F)`.
@@ -194,12 +194,12 @@ def write_features(
     for q in range(pooled.shape[0]):
         one, other = pooled[q, :width], pooled[q, width:]
         first = features[2 * q * n :] if split else features[q * n :]
-        if scales is not None:
+        if steps is not None:
             for k in range(n):
-                first[k] = np.float32((one[k] if split else one[k] - other[k]) * scales[k])
+                first[k] = np.float32((one[k] if split else one[k] - other[k]) * steps[k])
             if split:
                 for k in range(n):
-                    first[n + k] = np.float32(other[k] * scales[k])
+                    first[n + k] = np.float32(other[k] * steps[k])
         if wide is not None:
             if split:
                 for k in range(n):

@@ -4,7 +4,7 @@ Lives here: the code of a volume in the narrow state, pooling it, and volumes th
 Not here: the vector code that does it for blocks of filters (`lanes`), the wide state (`code`), and the
 arithmetic that proves that nothing overflows (`engine.narrow`).
 
-With a scale `s_k` for each filter, `P[k] ~ s_k Q[k]`, so that `max_count sum |Q[k]| < 2^15`, a projection
+With a step `s_k` for each filter, `P[k] ~ s_k Q[k]`, so that `max_count sum |Q[k]| < 2^15`, a projection
 `Q v` fits into 16 bits whatever the volume. A code is `gain (q_k / sigma) - gain c_k / s_k`, thresholded, in
 units of `s_k / gain` of its own filter; the gain is such that no code exceeds `MOST_CODE`. `q` is multiplied
 as `(q << shift) * factor >> 16`, the upper half of a product of 16 bits, and the bounds of positive and
