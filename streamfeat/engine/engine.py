@@ -353,7 +353,6 @@ class Engine(Shown):
             further=tuple(scale.snapshot() for _, scale in self._further),
         )
 
-    @one_thread
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of an engine with the same encoder and resolution.
 

@@ -10,7 +10,6 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from threading import RLock
 from typing import ParamSpec, TypeVar
 
 from streamfeat.errors import InputError
@@ -57,12 +56,14 @@ def one_thread(method: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(method)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> T:
         turn = args[0]._crew.turn  # type: ignore[attr-defined]
-        if not turn.acquire(blocking=False):
-            raise RuntimeError("an engine is used by two threads at once; give each its own")
+        try:
+            held = turn.pop()  # in one step, whatever other threads do
+        except IndexError:
+            raise RuntimeError("an engine is used by two threads at once; give each its own") from None
         try:
             return method(*args, **kwargs)
         finally:
-            turn.release()
+            turn.append(held)
 
     return guarded
 
@@ -74,7 +75,7 @@ class Crew:
         threads: how many, with the calling one.
 
     Attributes:
-        turn: held by the calling thread as long as it works.
+        turn: what the calling thread takes out as long as it works; empty then.
 
     Raises:
         InputError: they are not 1 to 256.
@@ -82,7 +83,7 @@ class Crew:
 
     def __init__(self, threads: int) -> None:
         """Start nothing yet; the threads end with this object."""
-        self.turn = RLock()
+        self.turn = [True]
         self.threads = usable_threads(threads)
         self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
 
