@@ -60,5 +60,4 @@ if __name__ == "__main__":
     if os.environ.get("NUMBA_DISABLE_JIT"):
         codecs.decode_evt3 = as_records(codecs.decode_evt3)
         codecs.decode_libcaer_cmp = as_records(codecs.decode_libcaer_cmp)
-        codecs.decode_mono = as_records(codecs.decode_mono)
     print("\n".join(decoded(Path(sys.argv[1]).read_bytes())))

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import naive
 import numpy as np
 
+from streamfeat.events import is_valid
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_DIRTY,
@@ -115,6 +116,47 @@ MONO = {
         (call.rest_ns + int(word) % 2**32) // 1000 > int(word) % 2**32 // 1000 for word in call.words
     ),
     "a row beyond 14 bits": lambda call: (call.words >> np.uint64(62) & np.uint64(1)).any(),
+    "whole thousands": lambda call: any(
+        (int(word) % 2**32 + call.rest_ns) % 1000 == 0 for word in call.words
+    ),
+    "no event on the sensor": lambda call: len(call.words) > 0 and call.result == 0,
+    "some events on the sensor": lambda call: 0 < call.result < len(call.words),
+}
+
+
+def _libcaer_us(call):
+    return (call.words >> np.uint64(32)).astype(np.int64) % 2**31
+
+
+LIBCAER = {
+    "no word": lambda call: len(call.words) == 0,
+    "the clock wraps": lambda call: (np.diff(_libcaer_us(call)) < -(2**30)).any(),
+    "an event out of order": lambda call: any(-(2**30) < d < 0 for d in np.diff(_libcaer_us(call))),
+    "the highest bit is set": lambda call: (call.words >> np.uint64(63)).any(),
+    "no event on the sensor": lambda call: len(call.words) > 0 and call.result == 0,
+    "some events on the sensor": lambda call: 0 < call.result < len(call.words),
+}
+
+
+def _usable(call):
+    return is_valid(call.events, (call.height, call.width))
+
+
+PLACE_EVENTS = {
+    "no event": lambda call: len(call.events) == 0,
+    "none can be used": lambda call: len(call.events) > 0 and not _usable(call).any(),
+    "all can be used": lambda call: len(call.events) > 0 and _usable(call).all(),
+    "the latest cannot be used": lambda call: (
+        _usable(call).any() and not _usable(call)[call.events["t"].argmax()]
+    ),
+    "the earliest cannot be used": lambda call: (
+        _usable(call).any() and not _usable(call)[call.events["t"].argmin()]
+    ),
+    "a polarity below and one above": lambda call: {-1, 2} <= set(call.events["p"].tolist()),
+    "none reaches beyond": lambda call: (
+        _usable(call).any() and call.events["t"][_usable(call)].max() < call.reached_us
+    ),
+    "a step back": lambda call: (np.diff(call.events["t"][_usable(call)]) < 0).any(),
 }
 
 
@@ -369,7 +411,7 @@ COUNT_EVENT = {
     "back from the limit": _on_count(lambda count, limit, step: count == -step * limit),
 }
 
-START_OF_BIN = {
+BIN_LENGTH = {
     "before time": lambda call: call.state.clock[CLOCK_NOW] == BEFORE_TIME,
     "in time": lambda call: call.state.clock[CLOCK_NOW] != BEFORE_TIME,
 }
@@ -593,6 +635,71 @@ READ_FEATURES = {
     "one cell": lambda call: call.state.pooled.shape[1] == 1,
     "many cells": lambda call: call.state.pooled.shape[1] > 4,
     "the other plane is current": lambda call: call.state.clock[CLOCK_PLANE] == 1,
+}
+
+READ_CELL = {name: READ_FEATURES[name] for name in READ_FEATURES if name != "one cell"} | {
+    "the last cell": lambda call: 0 < call.cell == call.state.pooled.shape[1] - 1,
+}
+
+SCORE_PARTS = {
+    "no feature at all": lambda call: not call.sums[:, -1].any(),
+    "features": lambda call: call.sums[:, -1].any(),
+    "no class": lambda call: len(call.bias) == 0,
+}
+
+
+def _cells_marked(call):
+    found = np.zeros_like(call.is_stale)
+    naive.mark_cells(call.x, call.y, call.operator, call.state, found)
+    return int(found.sum())
+
+
+MARK_CELLS = {
+    "no volume covers it": lambda call: _cells_marked(call) == 0,
+    "volumes of one cell": lambda call: _cells_marked(call) == 1 and len(call.is_stale) > 1,
+    "volumes of two cells": lambda call: _cells_marked(call) == 2,
+    "volumes of cells above, below and beside": lambda call: _cells_marked(call) >= 4,
+}
+
+
+def _shared_part(call):
+    """Whether a part that is summed holds features of a cell that is not stale."""
+    n, cells = len(call.reading.features), len(call.reading.is_stale)
+    stale = {naive.part_of(i, n) for i in range(n) if call.reading.is_stale[i * cells // n]}
+    fresh = {naive.part_of(i, n) for i in range(n) if not call.reading.is_stale[i * cells // n]}
+    return bool(stale & fresh)
+
+
+READ_STALE = {
+    "nothing": lambda call: not call.reading.is_stale.any() and not call.reading.parts.any(),
+    "a part that was asked for": lambda call: not call.reading.is_stale.any() and call.reading.parts.any(),
+    "everything": lambda call: call.reading.is_stale.all() and len(call.reading.is_stale) > 1,
+    "some cells": lambda call: 0 < call.reading.is_stale.sum() < len(call.reading.is_stale),
+    "a part of two cells": _shared_part,
+    "no class": lambda call: call.weights.rows.shape[1] == 0,
+    "classes": lambda call: call.weights.rows.shape[1] > 1,
+}
+
+
+def _trace_steps(call):
+    """Each event, with what it is one of."""
+    state = type(call.state)(*(field.copy() for field in call.state))
+    for i, event in enumerate(call.events.tolist()):
+        before, now = state.tally.copy(), int(state.clock[CLOCK_NOW])
+        naive.follow_event(*event, call.operator, state)
+        moved = int(state.clock[CLOCK_NOW]) != now
+        _, late, rejected, saturated, _ = (state.tally - before).tolist()
+        yield SimpleNamespace(
+            i=i, moved=moved, quiet=not moved and i > 0, late=late, rejected=rejected, saturated=saturated
+        )
+
+
+TRACE = {
+    "a new bin": lambda step: step.moved and step.i > 0,
+    "an event that changes a count": lambda s: s.quiet and not (s.late or s.rejected or s.saturated),
+    "an event that saturates": lambda s: s.quiet and s.saturated,
+    "a late event": lambda s: s.quiet and s.late,
+    "an event outside": lambda s: s.quiet and s.rejected,
 }
 
 
@@ -1024,6 +1131,53 @@ FOLLOW_CHANGES = {
     ),
 }
 
+NARROW_GAIN = {
+    "a shift": lambda call: call.result % 2**16 > 0,
+    "no shift": lambda call: call.result % 2**16 == 0 and call.result >> 16 >= 2**14,
+    "less than a quarter": lambda call: call.result >> 16 < 2**14,
+}
+
+MOVE_QUEUED = {
+    "no volume waits": lambda call: call.state.queued[call.part, 0] == 0,
+    "sums of columns": lambda call: (
+        call.state.queued[call.part, 0] > 0 and call.state.queued[call.part, 3] == 0
+    ),
+    "columns that are added": lambda call: (
+        call.state.queued[call.part, 0] > 0 < call.state.queued[call.part, 3]
+    ),
+    "columns that are subtracted": lambda call: call.state.queued[call.part, 3] < 0,
+    "several volumes": lambda call: call.state.queued[call.part, 0] > 1,
+    "of another part": lambda call: call.state.queued[call.part, 0] > 0 < call.part,
+}
+
+QUEUE_VOLUME = {
+    "no volume waits": lambda call: call.state.queued[call.part, 0] == 0,
+    "those of another cell wait": lambda call: (
+        call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 2] != call.state.cells[call.volume]
+    ),
+    "those of its cell wait": lambda call: (
+        call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 2] == call.state.cells[call.volume]
+    ),
+    "for other columns": lambda call: (
+        call.n == 1
+        and call.state.queued[call.part, 0] > 0
+        and call.state.queued[call.part, 3] != call.state.changes[call.part, 0]
+    ),
+    "one column": lambda call: call.n == 1 and abs(call.state.changes[call.part, 0]) == 1,
+    "several": lambda call: call.n > 1,
+}
+
+
+def _states(more=None):
+    return {
+        "narrow": lambda call: call.operator.steps is not None,
+        "wide": lambda call: call.operator.steps is None,
+        **(more or {}),
+    }
+
+
 LIST_MISSING = {
     "nothing is missing": lambda call: _current(call)[CURSOR_CODED] >= _n_volumes(call.state),
     "all are missing": lambda call: _current(call)[CURSOR_CODED] == 0,
@@ -1061,6 +1215,24 @@ SUM_COLUMNS = {
 
 CASES = {
     "follow_changes": FOLLOW_CHANGES,
+    "narrow_gain": NARROW_GAIN,
+    "move_queued": MOVE_QUEUED,
+    "queue_volume": QUEUE_VOLUME,
+    "follow_rest": _states(),
+    "enter_atoms": _states({"inverse": lambda call: call.operator.inverse}),
+    "write_code": _states({"inverse": lambda call: call.operator.inverse}),
+    "pool_row_of": _states(
+        {
+            "empty": lambda call: not call.state.moments[call.plane, call.row, MOMENT_SQUARES],
+            "triangle": lambda call: call.operator.kind == TRIANGLE,
+        }
+    ),
+    "write_features": _states(
+        {
+            "soft": lambda call: call.operator.kind == SOFT,
+            "split": lambda call: call.operator.kind == SPLIT,
+        }
+    ),
     "list_missing": LIST_MISSING,
     "list_entries": LIST_ENTRIES,
     "touched_bins": TOUCHED_BINS,
@@ -1069,6 +1241,8 @@ CASES = {
     "decode_evt3": {"no word": lambda call: len(call.words) == 0},
     "decode_libcaer_cmp": LIBCAER_CMP,
     "decode_mono": MONO,
+    "decode_libcaer": LIBCAER,
+    "place_events": PLACE_EVENTS,
     "turns_between": TURNS_BETWEEN,
     "decode_evt2": {"no word": lambda call: len(call.words) == 0},
     "decode_dat": {"no record": lambda call: len(call.records) == 0},
@@ -1080,7 +1254,7 @@ CASES = {
     "parse_rows": ROWS,
     "advance_to_bin": ADVANCE,
     "count_event": COUNT_EVENT,
-    "start_of_bin": START_OF_BIN,
+    "bin_length": BIN_LENGTH,
     "slot_of": SLOT_OF,
     "deviation": DEVIATION,
     "whitened_square": WHITENED_SQUARE,
@@ -1091,7 +1265,17 @@ CASES = {
     "pool": POOL,
     **LASSO,
     "encode_volume": ENCODE_VOLUME,
+    "read_cell": READ_CELL,
     "read_features": READ_FEATURES,
+    "score_parts": SCORE_PARTS,
+    "mark_cells": MARK_CELLS,
+    "read_stale": READ_STALE,
+    "trace": {
+        "no event": lambda call: len(call.events) == 0,
+        "features are not wanted": lambda call: len(call.events) > 0 and len(call.features) == 0,
+        "no class": lambda call: call.weights.rows.shape[1] == 0,
+        "a class": lambda call: call.weights.rows.shape[1] > 0,
+    },
     "mark_dirty": MARK_DIRTY,
     "pool_volume": POOL_VOLUME,
     "enter_code": ENTER_CODE,
@@ -1103,7 +1287,7 @@ CASES = {
     "move_volume": MOVE_VOLUME,
     "move_code": MOVE_CODE,
     "change_moments": FORMS,
-    "renew": RENEW,
+    "renew": RENEW | _states(),
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
     "fire_pixels": FIRE_PIXELS,
@@ -1120,5 +1304,6 @@ STEPS = {
     "decode_dat": (_dat_steps, DAT),
     "mark_noise": (_noise_steps, NOISE),
     "count_events": (_count_steps, COUNT_EVENTS),
+    "trace": (_trace_steps, TRACE),
 }
 """By kernel that goes step by step: the steps of a call, and the cases that one of them is."""

@@ -3,6 +3,7 @@
 The tests run every row against the twin of the same name in `naive`; benchmarks time the same rows.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,10 +27,13 @@ from streamfeat.kernels import (
     follow,
     ingest,
     lasso,
+    narrow,
     pixels,
     planes,
+    predict,
     spiking,
     surfaces,
+    trace,
     update,
     volume,
 )
@@ -51,6 +55,8 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
+from streamfeat.kernels.predict import PARTS, SUMMED, Weights
+from streamfeat.kernels.trace import Reading
 
 SCRATCH = {
     "touched",
@@ -63,6 +69,9 @@ SCRATCH = {
     "values",
     "entries",
     "changes",
+    "sums",
+    "queue",
+    "queued",
     "lines",
     "crowds",
 }
@@ -71,15 +80,18 @@ SCRATCH = {
 
 def copied(value):
     """A copy of what a kernel may change; an operator is frozen and stays itself."""
-    if isinstance(value, State):
-        return State(*(field.copy() for field in value))
+    if isinstance(value, State | Reading):
+        return type(value)(*(field.copy() for field in value))
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def assert_same(kernel, twin, *, scratch=frozenset(), name="result"):
     if isinstance(kernel, Operator):
         return
-    if isinstance(kernel, State):
+    if isinstance(kernel, Reading | Weights):
+        for field in kernel._fields:
+            assert_same(getattr(kernel, field), getattr(twin, field), name=field)
+    elif isinstance(kernel, State):
         for field in State._fields:
             if field == "encoded":  # which part encodes a volume is nobody's business
                 assert kernel.encoded.sum() == twin.encoded.sum()
@@ -165,6 +177,14 @@ def exact_but_atoms_of_a_part(kernel: Run, twin: Run) -> None:
     exact_but_atoms(kernel, twin)
 
 
+def exact_but_responses(kernel: Run, twin: Run) -> None:
+    """As `exact_but_scratch`, but for the order of the sums of a response."""
+    mine, yours = (run.after[-1].atoms for run in (kernel, twin))
+    np.testing.assert_allclose(mine, yours, rtol=1e-12, atol=1e-12)
+    yours[:] = mine
+    exact_but_scratch(kernel, twin)
+
+
 def exact_list(kernel: Run, twin: Run) -> None:
     """As `exact_but_scratch`, and the stack of volumes is no scratch."""
     exact_but_scratch(kernel, twin)
@@ -190,6 +210,30 @@ def exact_but_features(kernel: Run, twin: Run) -> None:
     assert_same(features, expected)
     for mine, yours in zip(kernel.after[at + 1 :], twin.after[at + 1 :], strict=True):
         assert_same(mine, yours)
+
+
+def exact_trace(kernel: Run, twin: Run) -> None:
+    """As `exact_but_features`; scores are those of the features, and what was read last is scratch."""
+
+    def without(run):
+        events, operator, state, _, _, features, _, accepted = run.after
+        return Run(run.before, (events, operator, state, features, accepted), None)
+
+    exact_but_features(without(kernel), without(twin))
+    _, operator, _, weights, reading, features, scores, _ = kernel.after
+    if not operator.inverse:
+        assert_same(scores, twin.after[6])
+    if len(features):
+        expected = np.zeros_like(scores)
+        naive.predict(features, weights, reading.roots.copy(), reading.sums.copy(), expected)
+        assert_same(scores, expected)
+
+
+def exact_but_roots(kernel: Run, twin: Run) -> None:
+    """All but the roots of the part that was summed last."""
+    for run in (kernel, twin):
+        run.after[-1].roots[:] = 0
+    exact(kernel, twin)
 
 
 def in_planes(state):
@@ -297,8 +341,15 @@ def pick(rng, options):
     return options[rng.integers(len(options))]
 
 
-def random_engine(rng, kinds=KINDS):
-    """A small engine with events in all of its window, read at some moment or never."""
+NARROW_KINDS = [("direct", "soft"), ("direct", "split")]
+"""Formulations and encodings that have a narrow state."""
+
+
+def random_engine(rng, kinds=KINDS, narrow=None):
+    """A small engine with events in all of its window, read at some moment or never.
+
+    In the narrow state or not; in half of the cases, where it can be, if that is not said.
+    """
     geometry = Geometry(
         patch=int(pick(rng, [1, 2, 3, 4, 9])),
         stride=int(rng.integers(1, 6)),
@@ -315,7 +366,11 @@ def random_engine(rng, kinds=KINDS):
     formulation, encoding = pick(rng, kinds)
     threshold = float(pick(rng, [0.02, 0.3]))
     n_filters = int(pick(rng, [1, 5, 32, 33]))
-    encoder = random_encoder(rng, geometry, n_filters, formulation, encoding, threshold=threshold)
+    if narrow is None:
+        narrow = rng.random() < 0.5
+    encoder = random_encoder(
+        rng, geometry, n_filters, formulation, encoding, threshold=threshold, narrow=narrow
+    )
     ahead = bool(rng.random() < 0.7)
     engine = Engine(
         encoder,
@@ -341,12 +396,12 @@ def bin_start(engine, ahead=0):
     return int(clock[CLOCK_ORIGIN]) + (now + ahead) * engine.encoder.geometry.bin_us
 
 
-def read_engine(rng, kinds=KINDS, *, more=0):
+def read_engine(rng, kinds=KINDS, *, more=0, narrow=None):
     """A random engine whose sums are current, the next bin partly prepared.
 
     With `more` events counted since, none of them in a new bin.
     """
-    engine = random_engine(rng, kinds)
+    engine = random_engine(rng, kinds, narrow)
     engine.advance(0)
     engine.features()
     engine.prepare(int(pick(rng, [-1, 1, 30, 300, 10**6])))
@@ -371,7 +426,7 @@ def random_values(rng, operator):
 
 def random_volume(rng, kinds=KINDS):
     """An operator and the projection and moments of one random volume that is not empty."""
-    operator = random_engine(rng, kinds)._operator
+    operator = random_engine(rng, kinds, narrow=False)._operator
     values = random_values(rng, operator)
     values[0] = values[0] or 1
     projection, moments = np.zeros(operator.columns.shape[1], np.int32), np.zeros(4, np.int64)
@@ -477,11 +532,11 @@ def make_mean_distance(rng):
     return rng.integers(0, 2**30, 33).astype(np.int32), int(rng.integers(1, 34))
 
 
-def make_start_of_bin(rng):
-    _, state = parts_of(random_engine(rng))
+def make_bin_length(rng):
+    operator, state = parts_of(random_engine(rng))
     if rng.random() < 0.3:
         state.clock[CLOCK_NOW] = BEFORE_TIME
-    return (state,)
+    return operator, state
 
 
 def make_slot_of(rng):
@@ -517,9 +572,37 @@ def make_libcaer_cmp(rng):
     return words, int(rng.integers(0, 2**50)), state, np.zeros(8 * len(words), EVENT_DTYPE)
 
 
+def random_sensor(rng):
+    return tuple(int(pick(rng, [1, 1000, 2**14, 2**15, 2**16])) for _ in range(2))
+
+
 def make_mono(rng):
     words = rng.integers(0, 2**64, random_length(rng, 80), np.uint64)
-    return words, int(rng.integers(0, 2**54)), int(rng.integers(0, 1000)), np.zeros(len(words), EVENT_DTYPE)
+    thousands = rng.random(len(words)) < 0.2
+    words[thousands] -= words[thousands] % np.uint64(2**32) % np.uint64(1000)
+    out, span = np.zeros(2 * len(words), np.int64), np.array([7, 7])
+    base_us, rest_ns = int(rng.integers(0, 2**54)), int(pick(rng, [0, 1, 999, rng.integers(0, 1000)]))
+    return words, base_us, rest_ns, *random_sensor(rng), out, span
+
+
+def make_libcaer(rng):
+    n = random_length(rng, 80)
+    us = np.sort(rng.integers(0, 2**31, n)).astype(np.uint64)
+    if rng.random() < 0.5:
+        us = (us + np.uint64(rng.integers(2**31))) % np.uint64(2**31)
+    us ^= (rng.random(n) < 0.1) * np.uint64(rng.choice([1, 2**31]))
+    words = us << np.uint64(32) | rng.integers(0, 2**32, n, np.uint64)
+    out, span = np.zeros(2 * n, np.int64), np.array([7, 7])
+    return words, int(rng.integers(0, 2**54)), *random_sensor(rng), out, span
+
+
+def make_place_events(rng):
+    events, height, width, span = make_time_span(rng)
+    events["t"] //= pick(rng, [1, 2**40])
+    events["t"][rng.random(len(events)) < 0.1] = pick(rng, [2**62, -(2**62), 2**62 - 1])
+    events["p"] = rng.choice([0, 1, 1, -1, 2], len(events))
+    reached_us = int(pick(rng, [-(2**62), 0, 2**20]))
+    return events, height, width, reached_us, np.zeros(len(events), np.int64), span
 
 
 def make_time_span(rng):
@@ -756,7 +839,7 @@ def make_lasso_code(rng):
 
 
 def make_fix_atoms(rng):
-    operator = random_engine(rng, LASSO_KINDS)._operator
+    operator = random_engine(rng, LASSO_KINDS, narrow=False)._operator
     k, scale = operator.n_filters, pick(rng, [1, 1e9])
     atoms = scale * rng.normal(size=k)
     return atoms, operator, random_code(rng, len(operator.offset))
@@ -825,14 +908,13 @@ def rewind(rng, plane, operator, state):
         cursors[:] = (coded, projected + 1, 0) if following == end else (coded, projected, following)
     state.pooled[plane] = 0
     for row in range(coded):
+        sums = state.pooled[plane, naive.cell_index(row, operator.shape, operator.pooling)]
+        if operator.steps is not None:
+            naive.pool_row_of(None, None, plane, row, 1, 0, operator, state, sums)
+            continue
         row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
         naive.encode_volume(*row_of, False, 0, operator, state)
-        naive.pool(
-            state.code[0, 0],
-            1,
-            operator.kind,
-            state.pooled[plane, naive.cell_index(row, operator.shape, operator.pooling)],
-        )
+        naive.pool(state.code[0, 0], 1, operator.kind, sums)
 
 
 def random_part(rng, state):
@@ -860,6 +942,11 @@ def make_project_volume(rng):
         volume, start = min(int(state.cursors[plane, 1]), volumes - 1), int(state.cursors[plane, 2])
     ahead = int(plane != state.clock[CLOCK_PLANE])
     return plane, volume, ahead, start, random_most(rng), part, operator, state
+
+
+def make_enter_atoms(rng):
+    operator, state = parts_of(read_engine(rng))
+    return operator.wide, *random_row(rng, state), random_part(rng, state), operator, state
 
 
 def make_enter_code(rng):
@@ -1000,11 +1087,13 @@ def changed_place(rng, operator, state):
     return position, row, column
 
 
-def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False):
-    operator, state = parts_of(read_engine(rng, kinds))
+def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False, narrow=None):
+    operator, state = parts_of(read_engine(rng, kinds, narrow=narrow))
+    if narrow and operator.steps is None:
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     places = [place for place in in_planes(state) if not stays or state.moments[place][MOMENT_SQUARES] > 0]
     if not places:
-        return make_change_volume(rng, kinds, stays=stays)
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     plane, volume = pick(rng, places)
     part, ahead = random_part(rng, state), int(plane != state.clock[CLOCK_PLANE])
     values = naive._gather(state.applied, ahead, volume, operator, state)
@@ -1017,14 +1106,162 @@ def make_change_volume(rng, kinds=EXACT_KINDS, *, stays=False):
     after = values.copy()
     after[listed] = [one_step(rng, int(values[entry]), operator) for entry in listed]
     if stays and not after.any():
-        return make_change_volume(rng, kinds, stays=stays)
+        return make_change_volume(rng, kinds, stays=stays, narrow=narrow)
     state.entries[part, : len(listed)] = listed
     state.changes[part, : len(listed)] = (after - values)[listed]
     return plane, volume, len(listed), part, operator, state
 
 
 def make_move_volume(rng):
-    return make_change_volume(rng, [kind for kind in EXACT_KINDS if kind[0] == "direct"], stays=True)
+    kinds = [kind for kind in EXACT_KINDS if kind[0] == "direct"]
+    return make_change_volume(rng, kinds, stays=True, narrow=False)
+
+
+def make_queue_volume(rng):
+    plane, volume, n, part, operator, state = make_change_volume(rng, NARROW_KINDS, stays=True, narrow=True)
+    wait = rng.random()
+    if wait < 0.7:  # others wait, of this volume's cell or of another, or as many as can
+        cell = naive.cell_index(volume, operator.shape, operator.pooling)
+        mine = [v for v in waiting(rng, plane, operator, state) if v != volume]
+        if not mine:
+            return make_queue_volume(rng)
+        sign = int(pick(rng, [-1, 0, 1]))
+        one_cell = [v for v in mine if (state.cells[v] == cell) == (wait < 0.5)] or mine
+        fill_queue(rng, plane, one_cell, sign, part, operator, state)
+    return plane, volume, n, part, operator, state
+
+
+def waiting(rng, plane, operator, state):
+    """Volumes that have a code in a plane and are not empty, in any order."""
+    found = [v for p, v in in_planes(state) if p == plane and state.moments[plane, v][MOMENT_SQUARES] > 0]
+    return rng.permutation(found).astype(int).tolist()
+
+
+def fill_queue(rng, plane, volumes, sign, part, operator, state):
+    """Let volumes of one cell wait, whose moments have changed but whose projections have not."""
+    width, limit = operator.columns.shape[1], operator.max_count
+    ahead, n, cell = int(plane != state.clock[CLOCK_PLANE]), 0, state.cells[volumes[0]]
+    most = pick(rng, [1, 3, state.queue.shape[1]])
+    for mine in volumes:
+        values = naive._gather(state.applied, ahead, mine, operator, state)
+        moments = state.moments[plane, mine]
+        open_ = np.flatnonzero(values * (sign or 1) < limit)
+        if state.cells[mine] != cell or not len(open_) or n == most:
+            continue
+        entry = int(pick(rng, open_))
+        after = values.copy()
+        after[entry] += sign or 1
+        if not after.any() or (values != _entries_of(plane, mine, operator, state)).any():
+            continue
+        before = naive.narrow_gain(moments, operator)
+        moments[:] = naive.sums_of(after, operator)[1]
+        column = operator.columns[entry]
+        state.sums[part, n + 1] = column
+        place = entry * width if sign else (n + 1) * width
+        row = (plane * state.projections.shape[1] + mine) * width
+        state.queue[part, n] = place, row, before + 2**32 * naive.narrow_gain(moments, operator)
+        n += 1
+    state.queued[part] = n, plane, cell, sign
+
+
+def _entries_of(plane, volume, operator, state):
+    """The entries that a volume's projection stands for."""
+    values = naive._gather(state.applied, int(plane != state.clock[CLOCK_PLANE]), volume, operator, state)
+    values[naive._entries_in(plane, volume, state) :] = 0
+    return values
+
+
+def make_move_queued(rng):
+    operator, state = parts_of(read_engine(rng, NARROW_KINDS, narrow=True))
+    plane, part = int(rng.integers(0, len(state.cursors))), random_part(rng, state)
+    if operator.steps is None or not (volumes := waiting(rng, plane, operator, state)):
+        return make_move_queued(rng)
+    if rng.random() < 0.8:
+        fill_queue(rng, plane, volumes, int(pick(rng, [-1, 0, 1])), part, operator, state)
+    return part, operator, state
+
+
+def make_follow_rest(rng):
+    if rng.random() < 0.3:
+        operator, state = parts_of(read_engine(rng, narrow=False))
+        return None, random_part(rng, state), operator, state
+    part, operator, state = make_move_queued(rng)
+    return operator.upper, part, operator, state
+
+
+def make_move_rows(rng):
+    part, operator, state = make_move_queued(rng)
+    n, plane, cell, sign = state.queued[part].tolist()
+    columns = operator.columns if sign else state.sums[part]
+    rows, sums = state.projections.reshape(-1), state.pooled[plane, cell]
+    return n, sign, state.queue[part], columns.reshape(-1), rows, operator.upper, operator.lower, sums
+
+
+def narrow_volume(rng):
+    """As `random_volume`, in the narrow state."""
+    operator = random_engine(rng, NARROW_KINDS, narrow=True)._operator
+    if operator.steps is None:
+        return narrow_volume(rng)
+    values = random_values(rng, operator)
+    values[0] = values[0] or 1
+    projection, moments = naive.sums_of(values, operator)
+    return operator, projection.astype(np.int16), moments
+
+
+def make_narrow_gain(rng):
+    operator, _, moments = narrow_volume(rng)
+    return moments, operator
+
+
+def make_narrow_code(rng):
+    operator, projection, moments = narrow_volume(rng)
+    code = random_code(rng, len(projection))
+    return naive.narrow_gain(moments, operator), projection, operator.upper, operator.lower, code
+
+
+def make_pool_narrow(rng):
+    *row, _ = make_narrow_code(rng)
+    pooled = rng.integers(-(2**30), 2**30, 2 * len(row[1])).astype(np.int32)
+    return int(pick(rng, [-1, 1])), *row, pooled
+
+
+def states_of(operator):
+    """The first arguments of what is compiled for one of the two states."""
+    return operator.upper, operator.wide
+
+
+def make_follow_changes(rng):
+    *arguments, operator, state = make_change_volume(rng)
+    return *states_of(operator), *arguments, operator, state
+
+
+def exact_once_moved(kernel: Run, twin: Run) -> None:
+    """As `exact_but_scratch`, once the queues are empty; of the twin, too, where others waited before."""
+    for run in (kernel, twin):
+        operator, state = run.after[-2:]
+        if operator.steps is not None:
+            for part in range(len(state.queued)):
+                naive.move_queued(part, operator, state)
+        naive.add_up(len(state.code), state)
+    exact_but_scratch(kernel, twin)
+
+
+def make_write_code(rng):
+    arguments = make_encode_volume(rng)
+    while not arguments[1][MOMENT_SQUARES]:
+        arguments = make_encode_volume(rng)
+    return *states_of(arguments[-2]), *arguments
+
+
+def make_pool_row_of(rng):
+    plane, volume, _, sign, part, operator, state = make_pool_volume(rng)
+    sums = np.zeros_like(state.pooled[0, 0])
+    return *states_of(operator), plane, volume, sign, part, operator, state, sums
+
+
+def make_write_features(rng):
+    operator, state, features = make_read_features(rng)
+    return operator.steps, operator.wide, operator, state.pooled[0].copy(), features
 
 
 def make_change_place(rng):
@@ -1054,10 +1291,96 @@ def make_follow_event(rng):
     return *(int(events[name][0]) for name in ("x", "y", "p", "t")), *sensor
 
 
+def random_weights(rng, n_features, classes):
+    length = SUMMED * math.ceil(math.ceil(n_features / PARTS) / SUMMED)
+    rows = rng.standard_normal((PARTS, classes, length)).astype(np.float32)
+    return Weights(rows, rng.standard_normal(classes).astype(np.float32))
+
+
+def reading_for(weights, n_features, cells):
+    """Scratch with anything in it."""
+    _, classes, length = weights.rows.shape
+    return Reading(
+        np.full(n_features, np.nan, np.float32),
+        np.full(length, np.nan, np.float32),
+        np.full((PARTS, classes + 1), np.nan, np.float32),
+        np.zeros(cells, np.uint8),
+        np.zeros(PARTS, np.uint8),
+    )
+
+
 def make_trace(rng):
-    events, *sensor, operator, state = make_follow(rng)
-    features, accepted = np.zeros((len(events), n_features(operator)), np.float32), np.zeros(len(events), int)
-    return events, *sensor, operator, state, features, accepted
+    events, operator, state = make_follow(rng)
+    n, classes = len(events), int(pick(rng, [0, 1, 1, 3]))
+    weights = random_weights(rng, n_features(operator), classes)
+    reading = reading_for(weights, n_features(operator), state.pooled.shape[1])
+    features = np.zeros((int(pick(rng, [0, n, n])), n_features(operator)), np.float32)
+    scores, accepted = np.zeros((n, classes), np.float32), np.zeros(n, int)
+    return events, operator, state, weights, reading, features, scores, accepted
+
+
+def make_read_stale(rng):
+    operator, state = parts_of(read_engine(rng, EXACT_KINDS))
+    weights = random_weights(rng, n_features(operator), int(pick(rng, [0, 1, 3])))
+    reading = reading_for(weights, n_features(operator), state.pooled.shape[1])
+    naive.read_features(operator, state, reading.features)
+    reading.sums[:] = rng.standard_normal(reading.sums.shape)
+    stale = rng.random(len(reading.is_stale)) < pick(rng, [0.0, 0.3, 1.0])
+    reading.features.reshape(len(stale), -1)[stale] = np.nan
+    reading.is_stale[:] = stale
+    reading.parts[:] = rng.random(PARTS) < pick(rng, [0.0, 0.0, 0.3])
+    return operator, state, weights, reading
+
+
+def make_mark_cells(rng):
+    operator, state = parts_of(random_engine(rng))
+    x, y = (int(rng.integers(len(ring))) for ring in (state.ring_columns, state.ring_rows))
+    return x, y, operator, state, (rng.random(state.pooled.shape[1]) < 0.1).astype(np.uint8)
+
+
+def random_features(rng, n, length):
+    features = np.abs(rng.standard_normal((n, length)) * 100).astype(np.float32)
+    features *= pick(rng, [np.float32(1), rng.choice([-1, 1], features.shape).astype(np.float32)])
+    features[rng.random(features.shape) < pick(rng, [0.2, 1.0])] = 0
+    return features
+
+
+def make_predict(rng):
+    n_features, classes, n = int(rng.integers(1, 1200)), int(pick(rng, [1, 3])), int(rng.integers(0, 4))
+    weights = random_weights(rng, n_features, classes)
+    reading = reading_for(weights, n_features, 1)
+    features = random_features(rng, n, n_features)
+    return features, weights, reading.roots, reading.sums, np.zeros((n, classes), np.float32)
+
+
+def make_sum_part(rng):
+    n_features, classes = int(rng.integers(1, 1200)), int(pick(rng, [0, 1, 3]))
+    weights = random_weights(rng, n_features, classes)
+    reading = reading_for(weights, n_features, 1)
+    features = random_features(rng, 1, n_features)[0]
+    return int(rng.integers(PARTS)), features, weights, reading.roots, reading.sums
+
+
+def make_score_parts(rng):
+    classes = int(pick(rng, [0, 1, 3]))
+    sums = rng.standard_normal((PARTS, classes + 1)).astype(np.float32)
+    sums[:, classes] = np.abs(sums[:, classes]) * pick(rng, [0, 1, 1])
+    return sums, rng.standard_normal(classes).astype(np.float32), np.zeros(classes, np.float32)
+
+
+def make_part_of(rng):
+    n_features = int(rng.integers(1, 1200))
+    return int(rng.integers(n_features)), n_features
+
+
+def make_read_cell(rng):
+    operator, state = parts_of(read_engine(rng))
+    return (
+        int(rng.integers(state.pooled.shape[1])),
+        operator,
+        state,
+        random_features(rng, 1, n_features(operator))[0],
+    )
 
 
 def make_read_features(rng):
@@ -1078,7 +1401,13 @@ def make_sum_columns(rng):
     if int(np.abs(changes[:n].astype(np.int64)).sum()) * 32767 >= 2**31:  # an operator allows no such sum
         changes = np.sign(changes)
     entries = np.append(rng.permutation(d), 0).astype(np.int32)
-    return n, entries, changes, frozen(columns), random_code(rng, width)
+    return (
+        n,
+        entries,
+        changes,
+        frozen(columns),
+        random_code(rng, width).astype(pick(rng, [np.int32, np.int16])),
+    )
 
 
 def sums_only(kernel: Run, twin: Run) -> None:
@@ -1264,6 +1593,8 @@ KERNELS = [
     Row(decode.decode_evt3, make_evt3),
     Row(decode.decode_libcaer_cmp, make_libcaer_cmp, exact_unless_refused),
     Row(decode.decode_mono, make_mono),
+    Row(decode.decode_libcaer, make_libcaer),
+    Row(decode.place_events, make_place_events),
     Row(decode.time_span, make_time_span),
     Row(denoise.mark_noise, make_mark_noise),
     Row(file_codes.turns_between, make_turns_between),
@@ -1276,7 +1607,7 @@ KERNELS = [
     Row(ingest.advance_to_bin, make_advance_to_bin),
     Row(ingest.is_valid, make_is_valid),
     Row(ingest.count_event, make_count_event),
-    Row(ingest.start_of_bin, make_start_of_bin),
+    Row(ingest.bin_length, make_bin_length),
     Row(ingest.slot_of, make_slot_of),
     Row(ingest.count_events, make_count_events, exact_below_the_top),
     Row(lasso.duality_gap, make_duality_gap, close),
@@ -1292,8 +1623,19 @@ KERNELS = [
     Row(lasso.solve_lasso_rows, make_solve_lasso_rows, rows_within_gap),
     Row(encode.encode_volume, make_encode_volume),
     Row(encode.pool_volume, make_pool_volume, exact_but_scratch),
+    Row(encode.read_cell, make_read_cell),
     Row(encode.read_features, make_read_features),
+    Row(encode.write_code, make_write_code),
+    Row(encode.pool_row_of, make_pool_row_of, exact_but_scratch),
+    Row(encode.write_features, make_write_features),
+    Row(narrow.narrow_gain, make_narrow_gain),
+    Row(narrow.narrow_code, make_narrow_code),
+    Row(narrow.pool_narrow, make_pool_narrow),
+    Row(narrow.move_rows, make_move_rows),
+    Row(narrow.move_queued, make_move_queued, exact_but_scratch),
+    Row(narrow.queue_volume, make_queue_volume, exact_once_moved),
     Row(planes.project_volume, make_project_volume, exact_but_scratch),
+    Row(planes.enter_atoms, make_enter_atoms, exact_but_responses),
     Row(planes.enter_code, make_enter_code, exact_but_scratch),
     Row(planes.count_filled, make_count_filled, exact_but_lines),
     Row(planes.list_missing, make_list_missing, exact_list),
@@ -1310,11 +1652,18 @@ KERNELS = [
     Row(update.read, make_read, exact_but_features),
     Row(change.change_volume, make_change_volume, exact_but_scratch),
     Row(change.move_volume, make_move_volume, exact_but_scratch),
-    Row(change.follow_changes, make_change_volume, exact_but_scratch),
+    Row(change.follow_changes, make_follow_changes, exact_once_moved),
+    Row(change.follow_rest, make_follow_rest, exact_but_scratch),
     Row(change.change_place, make_change_place, exact_but_atoms),
     Row(follow.follow_event, make_follow_event, exact_but_atoms),
     Row(follow.follow, make_follow, exact_but_atoms),
-    Row(follow.trace, make_trace, exact_but_features),
+    Row(predict.part_of, make_part_of),
+    Row(predict.sum_part, make_sum_part),
+    Row(predict.score_parts, make_score_parts),
+    Row(predict.predict, make_predict),
+    Row(trace.mark_cells, make_mark_cells),
+    Row(trace.read_stale, make_read_stale, exact_but_roots),
+    Row(trace.trace, make_trace, exact_trace),
     Row(pixels.draw_picture, make_draw_picture),
     Row(pixels.fire_pixels, make_fire_pixels),
     Row(spiking.spike_first, make_spike_first),

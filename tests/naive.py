@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 
+from streamfeat import events as events_module
+from streamfeat.events import EVENT_DTYPE
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_DIRTY,
@@ -90,10 +92,35 @@ def decode_libcaer_cmp(words, base_us, state, out):
     return _write(events, out)
 
 
-def decode_mono(words, base_us, rest_ns, out):
+def decode_mono(words, base_us, rest_ns, height, width, out, span):
+    events = np.zeros(len(words), EVENT_DTYPE)
     for i, word in enumerate(words.tolist()):
         ns = rest_ns + word % 2**32
-        out[i] = word // 2**32 % 2**16, word // 2**48 % 2**15, word // 2**63, base_us + ns // 1000
+        events[i] = word // 2**32 % 2**16, word // 2**48 % 2**15, word // 2**63, base_us + ns // 1000
+    out[:] = events.view(np.int64)
+    return time_span(events, height, width, span)
+
+
+def decode_libcaer(words, base_us, height, width, out, span):
+    events = np.zeros(len(words), EVENT_DTYPE)
+    before = 0
+    for i, word in enumerate(words.tolist()):
+        data, us = word % 2**32, word // 2**32 % 2**31
+        if before - us > 2**30:
+            base_us += 2**31
+        before = us
+        events[i] = data // 2**17, data // 4 % 2**15, data // 2 % 2, base_us + us
+    out[:] = events.view(np.int64)
+    return time_span(events, height, width, span)
+
+
+def place_events(events, height, width, reached_us, latest, span):
+    usable = events_module.is_valid(events, (height, width))
+    now = reached_us
+    for i, event in enumerate(events):
+        now = max(now, int(event["t"])) if usable[i] else now
+        latest[i] = now
+    return time_span(events[usable], height, width, span)
 
 
 def time_span(events, height, width, span):
@@ -409,8 +436,8 @@ def count_event(x, y, p, t, operator, state):
     return window.index(bin_index), row, column
 
 
-def start_of_bin(state):
-    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] != BEFORE_TIME else 2**62
+def bin_length(operator, state):
+    return 0 if state.clock[CLOCK_NOW] == BEFORE_TIME else operator.bin_us
 
 
 def count_events(events, operator, state):
@@ -590,6 +617,14 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
         if fresh:
             atoms[:] = 0
         return
+    write_code(None, None, projection, moments, atoms, fresh, part, operator, state)
+
+
+def write_code(narrow, wide, projection, moments, atoms, fresh, part, operator, state):
+    code = state.code[part, 0]
+    if operator.steps is not None:
+        narrow_code(narrow_gain(moments, operator), projection, operator.upper, operator.lower, code)
+        return
     sigma = deviation(moments, len(operator.columns), operator.eps)
     square = whitened_square(moments, sigma, operator)
     if operator.inverse:
@@ -603,21 +638,102 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
 
 
 def pool_volume(plane, row, volume, sign, part, operator, state):
-    row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
-    encode_volume(*row_of, sign > 0, part, operator, state)
-    sums = [state.pooled, *state.partial][part]
-    cell_of_volume = cell_index(volume, operator.shape, operator.pooling)
-    pool(state.code[part, 0], sign, operator.kind, sums[plane, cell_of_volume])
+    sums = [state.pooled, *state.partial][part][plane, cell_index(volume, operator.shape, operator.pooling)]
+    pool_row_of(None, None, plane, row, sign, part, operator, state, sums)
     state.encoded[part] += sign > 0
 
 
+def read_cell(cell, operator, state, features):
+    whole = features.copy()
+    read_features(operator, state, whole)
+    cells = state.pooled.shape[1]
+    features.reshape(cells, -1)[cell] = whole.reshape(cells, -1)[cell]
+
+
+def pool_row_of(narrow, wide, plane, row, sign, part, operator, state, sums):
+    projection, moments, atoms = (
+        field[plane, row] for field in (state.projections, state.moments, state.atoms)
+    )
+    if operator.steps is None:
+        encode_volume(projection, moments, atoms, sign > 0, part, operator, state)
+        pool(state.code[part, 0], sign, operator.kind, sums)
+    elif moments[MOMENT_SQUARES]:
+        pool_narrow(sign, narrow_gain(moments, operator), projection, operator.upper, operator.lower, sums)
+
+
 def read_features(operator, state, features):
-    pooled = state.pooled[int(state.clock[CLOCK_PLANE])].astype(np.int64)
-    parts = pooled.reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
+    write_features(None, None, operator, state.pooled[int(state.clock[CLOCK_PLANE])], features)
+
+
+def write_features(steps, wide, operator, pooled, features):
+    parts = pooled.astype(np.int64).reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
+    if operator.steps is not None:
+        if operator.kind != SPLIT:
+            parts = parts[:, :1] - parts[:, 1:]
+        features[:] = (parts * operator.steps[: operator.n_filters]).reshape(-1)
+        return
     if operator.kind == SPLIT:
         signed, absolute = parts[:, 0], parts[:, 1]
         parts = np.stack([(absolute + signed) / 2, (absolute - signed) / 2], axis=1)
     features[:] = parts.reshape(-1) / operator.unit
+
+
+# streamfeat.kernels.narrow
+
+
+def narrow_gain(moments, operator):
+    fraction, exponent = math.frexp(operator.gain / deviation(moments, len(operator.columns), operator.eps))
+    factor, shift = math.floor(fraction * 2**15), exponent + 1
+    if shift < 0:
+        factor, shift = math.floor(factor / 2 ** min(-shift, 15)), 0
+    return min(shift, 15) + 2**16 * factor
+
+
+def _narrow_parts(packed, projection, upper, lower):
+    factor, shift = divmod(packed % 2**32, 2**16)
+    shifted = projection.astype(np.int64) * 2**shift
+    assert (np.abs(shifted) < 2**15).all()  # or the kernel would see another number
+    level = np.floor_divide(shifted * factor, 2**16) + 2**15
+    return np.maximum(level - upper, 0), np.maximum(lower.astype(np.int64) - level, 0)
+
+
+def narrow_code(packed, projection, upper, lower, code):
+    positive, negative = _narrow_parts(packed, projection, upper, lower)
+    code[:] = positive - negative
+
+
+def pool_narrow(sign, packed, projection, upper, lower, pooled):
+    pooled += sign * np.concatenate(_narrow_parts(packed, projection, upper, lower)).astype(np.int32)
+
+
+def move_rows(n, sign, queue, columns, projections, upper, lower, pooled):
+    width = len(upper)
+    for column, row, packed in queue[:n].tolist():
+        projection = projections[row : row + width]
+        pool_narrow(-1, packed % 2**32, projection, upper, lower, pooled)
+        projection += (-1 if sign < 0 else 1) * columns[column : column + width]
+        pool_narrow(1, packed // 2**32, projection, upper, lower, pooled)
+
+
+def move_queued(part, operator, state):
+    n, plane, cell_of_all, sign = state.queued[part].tolist()
+    columns = operator.columns if sign else state.sums[part]
+    sums = [state.pooled, *state.partial][part]
+    move_rows(
+        n,
+        sign,
+        state.queue[part],
+        columns.reshape(-1),
+        state.projections.reshape(-1),
+        operator.upper,
+        operator.lower,
+        sums[plane, cell_of_all],
+    )
+    state.queued[part, 0] = 0
+
+
+def queue_volume(plane, volume, n, part, operator, state):
+    change_volume(plane, volume, n, part, operator, state)
 
 
 # streamfeat.kernels.planes
@@ -642,6 +758,12 @@ def project_volume(plane, volume, ahead, start, most, part, operator, state):
     values[following:] = 0
     state.projections[plane, row], state.moments[plane, row] = sums_of(values, operator)
     return min(most, len(filled)), following
+
+
+def enter_atoms(wide, plane, row, part, operator, state):
+    if operator.inverse:
+        atoms = state.atoms[plane, row]
+        atoms[1] = operator.gram.astype(np.float64) @ atoms[0]
 
 
 def enter_code(plane, volume, part, operator, state):
@@ -820,8 +942,13 @@ def move_volume(plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
 
 
-def follow_changes(plane, volume, n, part, operator, state):
+def follow_changes(narrow, wide, plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
+
+
+def follow_rest(narrow, part, operator, state):
+    if narrow is not None:
+        move_queued(part, operator, state)
 
 
 def change_place(position, row, column, operator, state):
@@ -840,13 +967,6 @@ def follow(events, operator, state):
         follow_event(*event, operator, state)
 
 
-def trace(events, operator, state, features, accepted):
-    for i, event in enumerate(events.tolist()):
-        follow_event(*event, operator, state)
-        read_features(operator, state, features[i])
-        accepted[i] = state.tally[TALLY_EVENTS]
-
-
 def follow_event(x, y, p, t, operator, state):
     n_volumes = volumes_of(operator)
     position, row, column = count_event(x, y, p, t, operator, state)
@@ -862,6 +982,83 @@ def follow_event(x, y, p, t, operator, state):
         behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
         budget = 24 + 100 * int(behind) // n_volumes
         look_ahead(projected, coded, budget, operator, state)
+
+
+# streamfeat.kernels.predict
+
+
+def part_of(feature, n_features):
+    return feature // -(-n_features // 16)
+
+
+def _sum_of_products(one, other):
+    """In the order that is promised: 32 lanes, each from its first product on, then halves of the lanes."""
+    lanes = np.zeros(32, np.float32)
+    for products in (one * other).reshape(-1, 32):
+        lanes = lanes + products
+    while len(lanes) > 1:
+        lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
+    return lanes[0]
+
+
+def sum_part(part, features, weights, roots, sums):
+    places = [i for i in range(len(features)) if part_of(i, len(features)) == part]
+    roots[:] = 0
+    roots[: len(places)] = np.sign(features[places]) * np.sqrt(np.abs(features[places]))
+    sums[part] = [_sum_of_products(roots, row) for row in (*weights.rows[part], roots)]
+
+
+def score_parts(sums, bias, scores):
+    total = np.zeros(sums.shape[1], np.float32)
+    for row in sums:
+        total = total + row
+    scores[:] = total[:-1] / (np.sqrt(total[-1]) or np.float32(1)) + bias
+
+
+def predict(features, weights, roots, sums, scores):
+    for row, found in zip(features, scores, strict=True):
+        for part in range(16):
+            sum_part(part, row, weights, roots, sums)
+        score_parts(sums, weights.bias, found)
+
+
+# streamfeat.kernels.trace
+
+
+def mark_cells(x, y, operator, state, is_stale):
+    row, column = int(state.ring_rows[y]), int(state.ring_columns[x])
+    found = []
+    for volume in range(volumes_of(operator)):
+        top, left = (place * operator.stride for place in divmod(volume, operator.shape[1]))
+        if top <= row < top + operator.patch and left <= column < left + operator.patch:
+            found.append(divmod(cell_index(volume, operator.shape, operator.pooling), operator.pooling))
+    if found:  # a small grid leaves cells without a volume; those between others are marked, too
+        (top, left), (bottom, right) = np.min(found, axis=0), np.max(found, axis=0)
+        square = is_stale.reshape(operator.pooling, operator.pooling)
+        square[top : bottom + 1, left : right + 1] = 1
+
+
+def read_stale(operator, state, weights, reading):
+    stale = np.flatnonzero(reading.is_stale)
+    for cell in stale.tolist():
+        read_cell(cell, operator, state, reading.features)
+        width = len(reading.features) // len(reading.is_stale)
+        for feature in range(cell * width, (cell + 1) * width):
+            reading.parts[part_of(feature, len(reading.features))] = 1
+    for part in np.flatnonzero(reading.parts).tolist():
+        if weights.rows.shape[1]:
+            sum_part(part, reading.features, weights, reading.roots, reading.sums)
+    reading.is_stale[:] = reading.parts[:] = 0
+    return len(stale)
+
+
+def trace(events, operator, state, weights, reading, features, scores, accepted):
+    for i, event in enumerate(events.tolist()):
+        follow_event(*event, operator, state)
+        read_features(operator, state, reading.features)
+        predict(reading.features[np.newaxis], weights, reading.roots, reading.sums, scores[i : i + 1])
+        features[i : i + 1] = reading.features
+        accepted[i] = state.tally[TALLY_EVENTS]
 
 
 # The mathematics itself, in float64 and without a quantised operator: what all of the above is for.

@@ -33,12 +33,19 @@ class Case:
     threshold: float
     seed: int
     threads: int = 1
+    narrow: bool = False
 
     @cached_property
     def encoder(self):
         rng = np.random.default_rng(self.seed)
         return random_encoder(
-            rng, self.geometry, self.n_filters, self.formulation, self.encoding, threshold=self.threshold
+            rng,
+            self.geometry,
+            self.n_filters,
+            self.formulation,
+            self.encoding,
+            threshold=self.threshold,
+            narrow=self.narrow,
         )
 
     def engine(self, origin_us=0, *, look_ahead=False):
@@ -69,6 +76,7 @@ def cases(draw, kind, max_bins=4):
         draw(st.sampled_from([0.02, 0.3])),
         draw(st.integers(0, 1000)),
         draw(st.sampled_from([1, 2, 3])),
+        narrow=draw(st.booleans()),
     )
 
 

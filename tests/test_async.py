@@ -527,11 +527,11 @@ def test_errors_of_a_sink_end_everything(error, kind, where):
 @pytest.mark.parametrize(("error", "kind"), ERRORS, ids=lambda v: getattr(v, "__name__", type(v).__name__))
 def test_errors_of_a_processor_end_everything(error, kind):
     class Broken:
-        def process(self, item):
+        def batches(self, item):
             raise error
             yield
 
-        def finish(self):
+        def last_batches(self):
             yield from ()
 
         def rest(self):

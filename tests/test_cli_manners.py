@@ -33,6 +33,17 @@ def test_the_version_is_that_of_the_package(run):
     assert (result.returncode, result.stdout) == (0, f"streamfeat {version('streamfeat')}\n")
 
 
+def test_a_replay_needs_no_linear_algebra_and_what_does_still_finds_it():
+    recording, model = (str(RECORDINGS / name) for name in ("digits_test.mcap", "digits.safetensors"))
+    code = f"import sys; sys.argv = ['streamfeat', 'replay', {recording!r}, '-m', {model!r}, '--json']\n"
+    code += "from streamfeat import cli\n"
+    code += "try: cli.main()\nexcept SystemExit: pass\n"
+    code += "print('scipy.linalg' in sys.modules)\n"
+    code += "import scipy.linalg.cython_blas, sklearn.svm; print(scipy.linalg.inv([[2.0]])[0, 0])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split()[-2:] == ["False", "0.5"]
+
+
 def test_help_imports_nothing_that_is_slow():
     code = "import sys; sys.argv = ['streamfeat', '-h']\nfrom streamfeat import cli\n"
     code += "try: cli.main()\nexcept SystemExit: pass\n"

@@ -402,7 +402,7 @@ def short(value):
     [
         {"format": "something-else"},
         {"format": None},
-        {"version": 2},
+        {"version": 3},
         {"version": "1\n2"},
         {"geometry": None},
         {"geometry": []},

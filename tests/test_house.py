@@ -29,7 +29,17 @@ ROOMS = {
     "simulate": {"errors", "events", "files", "kernels"},
     "camera_files": {"errors", "events", "files", "kernels", "messages"},
     "recordings": {"camera_files", "denoise", "errors", "events", "files", "messages", "report"},
-    "classify": {"engine", "errors", "events", "files", "messages", "recordings", "report", "work"},
+    "classify": {
+        "engine",
+        "errors",
+        "events",
+        "files",
+        "kernels",
+        "messages",
+        "recordings",
+        "report",
+        "work",
+    },
     "learn": {"engine", "errors", "events", "files", "kernels", "messages", "recordings", "work"},
     "convert": {
         "camera_files",
@@ -89,8 +99,11 @@ ONLY_IN = {
 SYNCHRONOUS = {"asyncio", "time", "logging", "io", "threading", "datetime", "socket", "os", "pathlib", "sys"}
 """What the engine, the kernels and all that they stand on may not know."""
 
-COMPILING = {"kernels.cache", "kernels.compiled"}
+COMPILING = {"kernels.cache", "kernels.compiled", "kernels.assembly"}
 """Modules among the kernels that hold none: how they are compiled, and where machine code is kept."""
+
+VECTOR_CODE = {"kernels.vectors", "kernels.lanes"}
+"""Modules whose functions write machine code."""
 
 CLOCKLESS = {"asyncio", "time", "logging", "io", "threading"}
 
@@ -194,7 +207,7 @@ def test_a_library_is_imported_where_it_belongs(library):
 def test_kernels_know_nothing_but_arrays(name):
     outside = {i.partition(".")[0] for i in imports_of(NAMES[name])} - {"streamfeat"}
     if name not in COMPILING:
-        more = {"llvmlite"} if name == "kernels.vectors" else set()
+        more = {"llvmlite"} if name in VECTOR_CODE else set()
         assert outside <= {"math", "numpy", "numba", "typing"} | more
     assert {i.partition(".")[0] for i in own_imports(NAMES[name])} <= {"kernels", "events"}
 
@@ -237,7 +250,7 @@ def test_nothing_in_a_module_can_run_what_it_reads_or_reorder_floats(name):
 
 
 @pytest.mark.parametrize(
-    "name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING - {"kernels.vectors"})
+    "name", sorted({n for n in NAMES if n.startswith("kernels.")} - COMPILING - VECTOR_CODE)
 )
 def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
@@ -246,11 +259,12 @@ def test_kernels_are_compiled_in_one_way(name):
             assert decorator.id in {"kernel", "inlined", "allocating"}
 
 
-def test_vector_code_is_generated_in_one_module_and_in_one_way():
-    """`kernels.vectors` offers functions that write machine code, and no others."""
-    functions = [node for node in tree_of(NAMES["kernels.vectors"]).body if isinstance(node, ast.FunctionDef)]
+@pytest.mark.parametrize("name", sorted(VECTOR_CODE))
+def test_vector_code_is_generated_in_one_way(name):
+    """These modules offer functions that write machine code, and no others."""
+    functions = [node for node in tree_of(NAMES[name]).body if isinstance(node, ast.FunctionDef)]
     generated = {f.name for f in functions if [ast.unparse(d) for d in f.decorator_list] == ["generated"]}
-    assert generated == set(importlib.import_module("streamfeat.kernels.vectors").__all__)
+    assert generated == set(importlib.import_module(f"streamfeat.{name}").__all__)
 
 
 @modules(packages=True)

@@ -24,6 +24,7 @@ from streams import (
 )
 
 from streamfeat.camera_files.event_files import open_events
+from streamfeat.classify.classifier import Classifier
 from streamfeat.engine import threads
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
@@ -189,12 +190,23 @@ def test_features_are_those_of_the_window_after_every_batch(kind, look_ahead, da
 def test_a_trace_holds_what_an_emission_after_each_event_would_have_given(kind, data):
     case = data.draw(cases(kind))
     events = data.draw(streams(case, 40))
-    engine, read = case.engine(look_ahead=True), case.engine()
-    features, accepted = engine.trace(events)
+    engine, scored, read = case.engine(look_ahead=True), case.engine(look_ahead=True), case.engine()
+    classifier = Classifier.untrained(["a", "b", "c"], case.encoder)
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    classifier.folded.rows[:] = rng.standard_normal(classifier.folded.rows.shape)
+    features, _, accepted = engine.trace(events)
+    cut = data.draw(st.integers(0, len(events)))
+    parts = [
+        scored.trace(part, classifier.folded, keep_features=keep)
+        for part, keep in ((events[:cut], False), (events[cut:], True))
+    ]
+    np.testing.assert_array_equal(parts[1].features, features[cut:])
+    scores = np.concatenate([part.scores for part in parts])
     assert features.shape == (len(events), case.encoder.n_features)
     for i in range(len(events)):
         read.feed(events[i : i + 1])
         np.testing.assert_array_equal(features[i], read.features())
+        np.testing.assert_array_equal(scores[i], classifier.scores(features[i]))
         assert accepted[i] == read.n_events
 
 

@@ -10,7 +10,8 @@ import tiny
 from live_net import free_port
 
 import streamfeat.cli as commands
-from streamfeat.cli.results import RESULTS, Field, as_markdown, complete, for_people
+from streamfeat.cli.rendering import as_markdown, complete, for_people
+from streamfeat.cli.results import RESULTS, Field
 
 PAGE = Path(commands.__file__).parent / "README.md"
 BEGIN, END = "<!-- fields:", "<!-- end of fields -->"

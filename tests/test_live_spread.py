@@ -15,7 +15,7 @@ pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
 from test_json import check
 
-from streamfeat.cli.results import complete
+from streamfeat.cli.rendering import complete
 from streamfeat.live.cluster import ClusterListen, ServedCamera
 from streamfeat.live.names import PlainNames, RosNames
 from streamfeat.live.network import Network, TopicWatch, open_session

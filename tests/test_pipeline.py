@@ -94,7 +94,8 @@ def test_results_are_those_of_a_plain_loop(digits, policy, speed):
         pipeline = Pipeline(recording.items(), one, [sink, other], speed=speed)
         asyncio.run(pipeline.run())
     same(sink.emissions, expected)
-    assert other.parts == sink.parts
+    same(other.emissions, sink.emissions)
+    assert [len(part) for part in other.parts] == [len(part) for part in sink.parts]
     assert one.stats() == loop_session.stats()
     assert np.array_equal(one.classifier.weights, loop_session.classifier.weights)
     assert (sink.closed, other.closed) == ("done", "done")

@@ -14,7 +14,7 @@ from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 
 CASES = {
-    f"{formulation}-{encoding}-{n_filters}": Case(
+    f"{formulation}-{encoding}-{n_filters}{'-narrow' if narrow else ''}": Case(
         Geometry(patch=patch, stride=3, n_bins=3, bin_us=1000, max_count=2),
         (31, 42),
         n_filters,
@@ -22,9 +22,11 @@ CASES = {
         encoding,
         0.1,
         3,
+        narrow=narrow,
     )
     for n_filters, patch in ((33, 4), (130, 9))
     for formulation, encoding in EXACT_KINDS
+    for narrow in (False, True)[: 2 if formulation == "direct" and encoding != "triangle" else 1]
 }
 
 

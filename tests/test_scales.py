@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import EXACT_KINDS, LASSO_KINDS, Case, cases, fed_in_every_way, mixed_steps, streams
 
+from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures
 from streamfeat.engine import threads
 from streamfeat.engine.encoder import Encoder
@@ -163,8 +164,13 @@ def test_a_trace_holds_what_an_emission_after_each_event_would_have_given(data):
     case = data.draw(scaled_cases(("direct", "soft")))
     events = data.draw(streams(case, 30))
     engine, read = case.engine(look_ahead=True), case.engine()
-    features, accepted = engine.trace(events)
+    features, _, accepted = engine.trace(events)
     assert features.shape == (len(events), case.encoder.n_features)
+    classifier = Classifier.untrained(["a", "b", "c"], case.encoder)
+    classifier.folded.rows[:] = np.random.default_rng(0).standard_normal(classifier.folded.rows.shape)
+    scored = case.engine(look_ahead=True).trace(events, classifier.folded, keep_features=False)
+    np.testing.assert_array_equal(scored.scores, classifier.scores(features))
+    assert scored.features.shape == (0, case.encoder.n_features)
     for i in range(len(events)):
         read.feed(events[i : i + 1])
         np.testing.assert_array_equal(features[i], read.features())

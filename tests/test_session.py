@@ -498,11 +498,11 @@ def test_who_is_behind_reads_less_and_loses_nothing(policy):
     whole = np.concatenate([*(item.events for item in items), tiny.stream([500_000])])
     assert np.array_equal(last.features, MODEL.encode(whole, tiny.RESOLUTION, origin_us=0))
     assert session.stats().events == 4001
-    # It can fall behind in the midst of a packet: it asks before every 32 events.
-    calls = iter([False] * 5 + [True] * 10**6)
+    # It can fall behind in the midst of a packet: it asks before every 256 events.
+    calls = iter([False] * 2 + [True] * 10**6)
     session = Session(MODEL, EmitPolicy.parse("event"), is_behind=lambda _: next(calls))
-    assert len(list(session.process(items[0]))) == 5 * 32 + 1
-    assert session.stats().events == 400
+    assert len(list(session.process(tiny.packet(tiny.steady(0, 50_000, 800))))) == 2 * 256 + 1
+    assert session.stats().events == 800
 
 
 @pytest.mark.parametrize("policy", ["event", "1ev", "auto"])

@@ -9,6 +9,7 @@ import tiny
 from streamfeat.errors import InputError
 from streamfeat.recordings.reader import Label
 from streamfeat.stream import table
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission
 from streamfeat.stream.outputs import Outputs
 
@@ -16,6 +17,7 @@ pa = pytest.importorskip("pyarrow", reason="extra export is not installed")
 pq = pytest.importorskip("pyarrow.parquet", reason="extra export is not installed")
 
 LABELS = ("cat", "dog")
+ROWS = ("t_us", "n_events", "features", "scores", "incomplete")
 SAMPLE = Label(1000, 500, "dog", "test", "a/b.dat")
 
 
@@ -38,8 +40,17 @@ def test_every_emission_is_a_row(tmp_path, name, monkeypatch):
     monkeypatch.setattr(table, "_GROUP_BYTES", 4 * 6 * 4)  # four rows
     emissions = [emission(i, sample=SAMPLE if i % 3 == 0 else None) for i in range(11)]
     sink = table.TableSink(tmp_path / name, 6, LABELS)
-    for start in range(0, 11, 3):
+    for start in range(0, 8, 3):
         sink.write(emissions[start : start + 3])
+    same = EmissionBatch(
+        **{name: np.array([getattr(e, name) for e in emissions[9:]]) for name in ROWS},
+        labels=LABELS,
+        topic="/cam",
+        sample=SAMPLE,
+        final=True,
+    )
+    emissions[9:] = list(same)
+    sink.write(same)
     assert not (tmp_path / name).exists()
     sink.close(failed=False)
     found = read(tmp_path / name)

@@ -6,7 +6,7 @@ import tiny
 from live_net import ListSink, compiled, free_port, running, until
 from test_json import check
 
-from streamfeat.cli.results import complete
+from streamfeat.cli.rendering import complete
 from streamfeat.live.listen import ListenJob
 from streamfeat.live.names import PlainNames
 from streamfeat.live.network import Network

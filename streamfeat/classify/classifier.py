@@ -4,7 +4,8 @@ Lives here: normalising pooled features, training with cross-validation, saving,
 Not here: features (`engine`, `encoder`), the one that goes on learning (`online`), when to predict
 (`pipeline`), scores of accuracy (`evaluate`).
 
-Predicting needs NumPy alone; scikit-learn is imported where something is learned, for that takes longer than
+Predicting is one kernel (`kernels.predict`), the same for one event and for many rows. scikit-learn is
+imported where something is learned, for that takes longer than
 all else before a first prediction.
 """
 
@@ -23,9 +24,12 @@ from streamfeat.classify.calibration import (
     temperature_field,
 )
 from streamfeat.classify.folds import assign_folds, check_labels
+from streamfeat.classify.weights import folded
 from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.engine.trace import scores_of
 from streamfeat.errors import InputError
 from streamfeat.files.safetensors_file import read_safetensors, write_safetensors
+from streamfeat.kernels.predict import Weights
 from streamfeat.report.shown import Shown
 
 __all__ = ["Classifier", "normalise_features", "train_classifier"]
@@ -50,17 +54,11 @@ def normalise_features(features: NDArray[np.float32]) -> NDArray[np.float32]:
     Returns:
         same shape; all zero where the features are.
     """
-    roots, length = _roots(features)
-    return np.asarray(roots / length, np.float32)
-
-
-def _roots(features: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Signed square roots, and the length of each row of them; one where a row is zero."""
     size = np.abs(features)
     # The squares of the roots add up to the sizes.
     length = np.sqrt(size.sum(axis=-1, keepdims=True))
-    np.sqrt(size, out=size)
-    return np.copysign(size, features, out=size), np.where(length > 0, length, np.float32(1))
+    roots = np.copysign(np.sqrt(size, out=size), features)
+    return np.asarray(roots / np.where(length > 0, length, np.float32(1)), np.float32)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -76,6 +74,7 @@ class Classifier(Shown):
         fingerprint: of the encoder it was trained with.
         provenance: how it was trained (JSON values).
         temperature: what makes probabilities of its scores, see `calibration`; None where it was not fitted.
+        folded: weights and bias with the standardisation in them, for kernels.
     """
 
     labels: tuple[str, ...]
@@ -86,14 +85,11 @@ class Classifier(Shown):
     fingerprint: str
     provenance: Mapping[str, Any] = field(default_factory=dict)
     temperature: float | None = None
-    _folded: NDArray[np.float32] = field(init=False, repr=False, compare=False)
-    _folded_bias: NDArray[np.float32] = field(init=False, repr=False, compare=False)
+    folded: Weights = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Fold standardisation into the weights."""
-        folded = self.weights / self.scale[:, np.newaxis]
-        object.__setattr__(self, "_folded", folded)
-        object.__setattr__(self, "_folded_bias", self.bias - self.centre @ folded)
+        object.__setattr__(self, "folded", folded(self.weights, self.bias, self.centre, self.scale))
 
     @property
     def linear(self) -> "Classifier":
@@ -126,16 +122,19 @@ class Classifier(Shown):
 
     def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """Score of every label: `(C,)` for features `(F,)`, `(n, C)` for `(n, F)`."""
-        # As `prepare(features) @ weights + bias`, with all that does not depend on the features worked out.
-        roots, length = _roots(features)
-        # Row by row: a product of matrices would have other last bits for another number of rows.
-        products = [row @ self._folded for row in roots.reshape(-1, roots.shape[-1])]
-        totals = np.reshape(products, (*features.shape[:-1], len(self.bias)))
-        return _spread(totals / length + self._folded_bias)
+        rows = np.array(features, np.float32, order="C").reshape(-1, len(self.centre))
+        found = scores_of(rows, self.folded)
+        return _spread(found.reshape(*np.shape(features)[:-1], found.shape[1]))
 
     def emitted(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """What an emission says of every label: probabilities if there is a temperature, else scores."""
-        scores = self.scores(features)
+        return self._calibrated(self.scores(features))
+
+    def emitted_after(self, scores: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same from the scores `(n, C)`, or `(n, 1)` for two classes, that kernels made with `folded`."""
+        return self._calibrated(_spread(scores))
+
+    def _calibrated(self, scores: NDArray[np.float32]) -> NDArray[np.float32]:
         return scores if self.temperature is None else probabilities(scores, self.temperature)
 
     def predict(self, features: NDArray[np.float32]) -> str:
@@ -209,7 +208,7 @@ class Classifier(Shown):
                 temperature=checked_temperature(path, header),
             )
             # No score can be larger than this: normalised features have unit length.
-            largest = np.abs(loaded._folded).sum(axis=0) + np.abs(loaded._folded_bias)
+            largest = np.abs(loaded.folded.rows).sum(axis=(0, 2)) + np.abs(loaded.folded.bias)
         if not np.isfinite(largest).all():
             raise InputError(f"{path}: scores would not be finite; train it again")
         return loaded

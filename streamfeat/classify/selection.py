@@ -61,5 +61,6 @@ def with_best_filters(encoder: Encoder, classifier: Classifier, n: int) -> Encod
         mean=encoder.mean,
         eps=encoder.operator.eps,
         gap=encoder.operator.gap,
+        narrow=encoder.is_narrow,
         provenance={**encoder.provenance, "kept_filters": best.tolist(), "of_filters": len(weights)},
     )

@@ -29,6 +29,7 @@ from streamfeat.cli import (
     streaming,
     viewing,
 )
+from streamfeat.cli.blas import spare_blas
 from streamfeat.cli.program import app, err
 from streamfeat.errors import InputError
 
@@ -61,6 +62,7 @@ def main() -> NoReturn:
     reads standard output any more, as behind `| head`, a command ends silently with 1.
     """
     signal.signal(signal.SIGTERM, _interrupt)
+    spare_blas()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # where the encoding lacks a letter, its number is shown
             stream.reconfigure(errors="backslashreplace")

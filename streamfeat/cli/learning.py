@@ -150,6 +150,8 @@ def learn(
         "coherence": encoder.provenance["coherence"][-1],
         "unused": encoder.provenance["unused"],
         "bytes": model.stat().st_size,
+        "state": "narrow" if encoder.is_narrow else "wide",
+        "wide_because": encoder.provenance.get("wide_because"),
     }
     entries = encoder.geometry.entries
     if encoder.provenance["rows"] == "free" and encoder.n_filters < entries:

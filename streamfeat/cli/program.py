@@ -18,7 +18,8 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from streamfeat.cli.consoles import err, out
-from streamfeat.cli.results import RESULTS, complete, for_people
+from streamfeat.cli.rendering import complete, for_people
+from streamfeat.cli.results import RESULTS
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import is_replaced, refuse_input
 from streamfeat.files.locations import Location, location_of

@@ -1,14 +1,12 @@
-"""What commands print as their result: the fields of `--json`, and the same as a table for people.
+"""What commands print as their result: the fields of `--json`.
 
-Lives here: each field of each command with its type, its meaning, and what people read in its place.
-Not here: where the figures come from (each command), and how tables are drawn (`program`).
+Lives here: each field of each command with its type, its meaning, and its name in the table for people.
+Not here: where the figures come from (each command), and how results are rendered (`rendering`).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-__all__ = ["RESULTS", "Field", "as_markdown", "complete", "for_people"]
+__all__ = ["RESULTS", "Field"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +165,8 @@ RESULTS: dict[str, dict[str, Field]] = {
         "coherence": Field("number", "largest likeness of two filters, 0 to 1", hidden=True),
         "unused": Field("int", "filters that no volume uses", quiet=True),
         "bytes": Field("int", "of the file"),
+        "state": Field("text", "`narrow`, engines keep sums of 16 bits, or `wide`, of 32"),
+        "wide_because": Field("text?", "why the state is not narrow", quiet=True),
         "log_determinant": Field(
             "text?", "with --rows free and fewer filters than entries: what it is taken of", hidden=True
         ),
@@ -343,60 +343,3 @@ RESULTS: dict[str, dict[str, Field]] = {
     },
 }
 """The result of each command that takes --json: its fields in order."""
-
-
-def complete(command: str, result: Mapping[str, Any]) -> dict[str, Any]:
-    """A result with every field of its command, in order; null, [] or {} for what is not there.
-
-    Fields that the table lacks come last: tests hold commands to the table, users get what there is.
-    """
-    empty: dict[str, Any] = {"[": [], "{": {}}
-    fields = RESULTS[command]
-    known = {name: result.get(name, empty.get(field.kind[0])) for name, field in fields.items()}
-    return known | {name: value for name, value in result.items() if name not in fields}
-
-
-def for_people(result: Mapping[str, Any], fields: Mapping[str, Field]) -> list[tuple[str, str]]:
-    """Names and values as people read them, without what is empty, and without zeros that say nothing."""
-    rows = []
-    for name, value in result.items():
-        field = fields.get(name, Field("text", ""))
-        if field.hidden or value is None or value in ([], {}, "") or (field.quiet and not value):
-            continue
-        rows.append((field.shown or name.replace("_", " "), _text(name, value)))
-    return rows
-
-
-def _text(name: str, value: Any) -> str:
-    if name == "resolution":
-        return f"{value[1]}x{value[0]}"
-    if isinstance(value, Mapping) and "schema" in value:
-        # A camera file has a format instead, and no messages.
-        count = f", {value['messages']:,} messages" if value["messages"] or value["schema_encoding"] else ""
-        return f"{value['name']} ({value['schema']}{count})"
-    if isinstance(value, Mapping) and value.keys() == {"resolution", "packets"}:
-        return f"{_text('resolution', value['resolution'])} ({value['packets']:,} packets)"
-    if name == "other_resolutions" and len(value) > 3:
-        return f"{_text(name, value[:3])} and {len(value) - 3} others"
-    if name == "objective":
-        return f"{value[0]:.6g} at first, {value[-1]:.6g} at last"
-    if name == "empty_share":
-        return f"{100 * value:.0f} %"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_text('', inner)}" for key, inner in value.items())
-    if isinstance(value, list):
-        return ", ".join(_text("", one) for one in value)
-    return str(value)
-
-
-def as_markdown() -> str:
-    """All fields of all commands, as the page of this room shows them."""
-    parts = []
-    for command, fields in RESULTS.items():
-        rows = "".join(f"| `{name}` | {field.kind} | {field.means} |\n" for name, field in fields.items())
-        parts.append(f"### {command}\n\n| field | type | what |\n|---|---|---|\n{rows}")
-    return "\n".join(parts)

@@ -166,12 +166,30 @@ def _files(folder: Location) -> Iterable[tuple[Location, str]]:
     """Files in a folder, however deep, each with its path from there."""
     if isinstance(folder, StoreLocation):
         return files_below(folder)
-    # A link that leads nowhere is a sample that cannot be read, and is reported as one.
-    return (
-        (path, path.relative_to(folder).as_posix())
-        for path in folder.rglob("*")
-        if path.is_file() or (path.is_symlink() and not path.exists())
-    )
+    return _local_files(folder, folder, frozenset())
+
+
+def _local_files(folder: Path, top: Path, above: frozenset[tuple[int, int]]) -> Iterator[tuple[Path, str]]:
+    """Files below a folder, those of folders that are links too, unless one leads back to where it is.
+
+    Raises:
+        InputError: a folder may not be entered: its samples would be missing without a word.
+    """
+    try:
+        about = folder.stat()
+        inside = sorted(folder.iterdir())
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be entered: {error.strerror}; its samples would be missing"
+        ) from None
+    if (about.st_dev, about.st_ino) in above:
+        return
+    for path in inside:
+        if path.is_dir():
+            yield from _local_files(path, top, above | {(about.st_dev, about.st_ino)})
+        elif path.is_file() or path.is_symlink():
+            # A link that leads nowhere is a sample that cannot be read, and is reported as one.
+            yield path, path.relative_to(top).as_posix()
 
 
 def convert(

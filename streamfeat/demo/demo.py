@@ -26,6 +26,7 @@ from streamfeat.recordings.reader import Label, open_recording
 from streamfeat.recordings.writer import RecordingWriter
 from streamfeat.simulate.camera import CameraModel
 from streamfeat.simulate.saccades import digit_samples
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.compiling import Compilers
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
@@ -186,13 +187,13 @@ class _Watched:
     def __init__(self, session: Session, picture: EventPicture) -> None:
         self._session, self._picture = session, picture
 
-    def process(self, item: Packet | Label) -> Iterator[Emission]:
+    def batches(self, item: Packet | Label) -> Iterator[EmissionBatch]:
         if isinstance(item, Packet):
             self._picture.add(item.events)
-        return self._session.process(item)
+        return self._session.batches(item)
 
-    def finish(self) -> Iterator[Emission]:
-        return self._session.finish()
+    def last_batches(self) -> Iterator[EmissionBatch]:
+        return self._session.last_batches()
 
     def rest(self) -> None:
         self._session.rest()

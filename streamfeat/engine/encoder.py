@@ -25,9 +25,10 @@ from streamfeat.files.safetensors_file import one_line, read_safetensors, write_
 from streamfeat.kernels.layout import FEATURE_ENCODINGS, Operator
 from streamfeat.report.shown import Shown
 
-__all__ = ["FORMAT_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
+__all__ = ["NARROW_VERSION", "WIDE_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
 
-FORMAT_VERSION = 1
+WIDE_VERSION, NARROW_VERSION = 1, 2
+"""Format versions of files: the second holds what the first does, and the steps of the narrow state."""
 
 _KIND = "streamfeat-encoder"
 _SCALES_KIND = "streamfeat-scales"
@@ -138,12 +139,15 @@ class Encoder(Shown):
         mean: NDArray[np.floating[Any]],
         eps: float = 0.01,
         gap: float = 1e-6,
+        narrow: bool = False,
         provenance: Mapping[str, Any] | None = None,
     ) -> Self:
         """Fold whitening and mean removal into one operator and quantise it.
 
-        One scale serves all filters: an entry of the operator is off by at most `max |P| / 65534`, so a
-        code is off by about 1e-5 of the largest, and no array of scales walks through the hot loop.
+        In the wide state one step serves all filters: an entry of the operator is off by at most
+        `max |P| / 65534`, so a code is off by about 1e-4 of the largest. In the narrow state each filter has
+        its own, so that sums of 16 bits cannot overflow: a code is off by about 1e-3 of the largest, the
+        engine takes half the memory, and an event half the time.
 
         Args:
             geometry: of the local volumes, `d` entries each.
@@ -155,6 +159,8 @@ class Encoder(Shown):
             mean: `(d,)`, `mu`.
             eps: added to the variance of a volume.
             gap: relative duality gap at which the lasso stops (inverse formulation).
+            narrow: choose the narrow state where it is exact enough. Where not (`inverse`, `triangle`, large
+                volumes of large counts), the encoder has the wide state, and `provenance` says why.
             provenance: JSON values kept with the model.
 
         Raises:
@@ -165,7 +171,15 @@ class Encoder(Shown):
         mean32 = np.array(mean, np.float32, order="C")
         _check_parameters(geometry, formulation, encoding, threshold, filters32, whitening32, mean32)
         fixed = fixed_fields(geometry, formulation, encoding, threshold, filters32)
-        operator = quantise(geometry, fixed, filters32, whitening32, mean32, eps, gap)
+        notes = dict(provenance or {})
+        parameters = geometry, fixed, filters32, whitening32, mean32, eps, gap
+        try:
+            operator = quantise(*parameters, narrow=narrow)
+        except InputError as error:
+            if not narrow:
+                raise
+            notes["wide_because"] = str(error)
+            operator = quantise(*parameters)
         return cls._checked(
             geometry=geometry,
             formulation=formulation,
@@ -175,7 +189,7 @@ class Encoder(Shown):
             whitening=whitening32,
             mean=mean32,
             operator=operator,
-            provenance=dict(provenance or {}),
+            provenance=notes,
         )
 
     @classmethod
@@ -192,12 +206,17 @@ class Encoder(Shown):
         """SHA-256 over everything that decides what features are."""
         digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
         for name, value in zip(Operator._fields, self.operator, strict=True):
-            if name == "shape":
-                continue  # of the sensor
+            if name in ("shape", "wide", "upper", "lower", "gain") or (name == "steps" and value is None):
+                continue  # of the sensor, or of the narrow state alone
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
         for scale in self.further:
             digest.update(scale.fingerprint.encode())
         return digest.hexdigest()
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether engines keep projections in 16 bits, and not in 32; of the first scale."""
+        return self.operator.steps is not None
 
     @property
     def n_filters(self) -> int:
@@ -246,17 +265,18 @@ class Encoder(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file; the file appears whole or not at all."""
+        version = NARROW_VERSION if any(scale.is_narrow for scale in self.scales) else WIDE_VERSION
         if self.further:
             parts = joined_parts([scale._parts() for scale in self.scales])
-            write_safetensors(Path(path), _SCALES_KIND, FORMAT_VERSION, *parts)
+            write_safetensors(Path(path), _SCALES_KIND, version, *parts)
         else:
-            write_safetensors(Path(path), _KIND, FORMAT_VERSION, *self._parts())
+            write_safetensors(Path(path), _KIND, version, *self._parts())
 
     def _parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Arrays and header of the first scale."""
         operator = self.operator
         arrays = {"filters": self.filters, "whitening": self.whitening, "mean": self.mean}
-        arrays |= {name: getattr(operator, name) for name in _STORED_ARRAYS}
+        arrays |= {name: getattr(operator, name) for name in _stored_arrays(narrow=self.is_narrow)}
         header = {
             "geometry": dataclasses.asdict(self.geometry),
             "formulation": self.formulation,
@@ -274,7 +294,7 @@ class Encoder(Shown):
         Raises:
             InputError: the file is missing, cut short, of another version, or not a model.
         """
-        arrays, header = read_safetensors(Path(path), (_KIND, _SCALES_KIND), FORMAT_VERSION)
+        arrays, header = read_safetensors(Path(path), (_KIND, _SCALES_KIND), WIDE_VERSION, NARROW_VERSION)
         try:
             if header["format"] == _KIND:
                 return cls._from_parts(arrays, header)
@@ -293,7 +313,9 @@ class Encoder(Shown):
         if not all(math.isfinite(value) for value in scalars.values()):
             raise InputError("a scalar is not finite")
         fields = fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
-        operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in _STORED_ARRAYS})
+        narrow = "steps" in arrays
+        stored, fields["wide"] = _stored_arrays(narrow=narrow), None if narrow else True
+        operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in stored})
         provenance = header.get("provenance", {})
         if not isinstance(provenance, dict):
             raise InputError("provenance is not a JSON object")
@@ -310,7 +332,11 @@ class Encoder(Shown):
         )
 
 
-_STORED_ARRAYS = ("columns", "offset", "quadratic", "linear", "square_norms")
+def _stored_arrays(*, narrow: bool) -> tuple[str, ...]:
+    arrays = ("columns", "offset", "quadratic", "linear", "square_norms")
+    return (*arrays, "steps") if narrow else arrays
+
+
 _STORED_SCALARS = ("scale", "eps", "quadratic_scale", "linear_scale", "constant", "reach", "gap")
 
 

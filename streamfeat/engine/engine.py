@@ -17,10 +17,11 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, checked_time
 from streamfeat.engine.state import allocate_state
-from streamfeat.engine.threads import Crew
+from streamfeat.engine.threads import Crew, one_thread
+from streamfeat.engine.trace import Trace, joined, trace_events
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
-from streamfeat.kernels.follow import follow, trace
+from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
@@ -37,6 +38,7 @@ from streamfeat.kernels.layout import (
     TALLY_EVENTS,
 )
 from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
+from streamfeat.kernels.predict import Weights
 from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
 from streamfeat.report.shown import Shown
 
@@ -111,6 +113,7 @@ class Engine(Shown):
             if scale.geometry.has_room(resolution)
         ]
 
+    @one_thread
     def feed(self, batch: Events) -> None:
         """Count the events of a batch. Exact, whatever the order, and cheap.
 
@@ -127,6 +130,7 @@ class Engine(Shown):
         for _, scale in self._further:
             scale.feed(events)
 
+    @one_thread
     def follow(self, batch: Events) -> None:
         """Feed a batch event by event, with features brought up to date after each.
 
@@ -144,32 +148,27 @@ class Engine(Shown):
         for _, scale in self._further:
             scale.follow(events)
 
-    def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Feed a batch event by event, and read the features after each.
+    @one_thread
+    def trace(self, batch: Events, weights: Weights | None = None, *, keep_features: bool = True) -> Trace:
+        """Feed a batch event by event, and read features and scores after each.
 
         Args:
             batch: as for `feed`, `n` events.
-
-        Returns:
-            features `(n, n_features)` float32, a row after each event, and `(n,)` int64, how many events
-            had been accepted by then.
+            weights: of a linear classifier for these features; no scores without.
+            keep_features: whether features are wanted, or scores alone: copying them takes time.
 
         Raises:
             InputError: as for `feed`.
         """
         events = self._checked(batch)
         self._update()
-        features = np.empty((len(events), n_features(self._operator)), np.float32)
-        accepted = np.empty(len(events), np.int64)
-        trace(events, self._operator, self._state, features, accepted)
         if not self.encoder.further:
-            return features, accepted
-        every = np.zeros((len(events), self.encoder.n_features), np.float32)
-        every[:, : features.shape[1]] = features
-        for place, scale in self._further:
-            every[:, place] = scale.trace(events)[0]
-        return every, accepted
+            return trace_events(events, self._operator, self._state, weights, keep_features=keep_features)
+        first = trace_events(events, self._operator, self._state, None)
+        scales = [(place, scale.trace(events)) for place, scale in self._further]
+        return joined(first, scales, self.encoder.n_features, weights, keep_features=keep_features)
 
+    @one_thread
     def prepare(self, columns: int) -> bool:
         """Use idle time to look ahead to the next bin boundary.
 
@@ -225,6 +224,7 @@ class Engine(Shown):
             return events.copy()  # one compiled kernel serves all, and a copy costs about 1 ns an event
         return events
 
+    @one_thread
     def advance(self, t_us: int) -> None:
         """Let stream time pass without events. Going back in time does nothing.
 
@@ -241,6 +241,7 @@ class Engine(Shown):
         for _, scale in self._further:
             scale.advance(t_us)
 
+    @one_thread
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
         if self._crew.threads > 1:
@@ -251,6 +252,7 @@ class Engine(Shown):
             features[place] = scale.features()
         return features
 
+    @one_thread
     def codes(self) -> NDArray[np.float32]:
         """The code of every local volume of the first scale, a copy: `(rows, columns, K)` float32, before any
         split.
@@ -260,17 +262,20 @@ class Engine(Shown):
         plane = state.clock[CLOCK_PLANE]
         rows = zip(state.projections[plane], state.moments[plane], state.atoms[plane], strict=True)
         codes = np.empty((len(state.moments[plane]), operator.n_filters), np.float32)
+        worth = 1 / operator.unit if operator.steps is None else operator.steps
         for code, (projection, moments, atoms) in zip(codes, rows, strict=True):
             encode_volume(projection, moments, atoms, False, 0, operator, state)
-            code[:] = state.code[0, 0, : operator.n_filters] / operator.unit
+            code[:] = (state.code[0, 0] * worth)[: operator.n_filters]
         return codes.reshape(*self.grid_shape, operator.n_filters)
 
+    @one_thread
     def counts(self) -> NDArray[np.int32]:
         """The signed counts of the current window in the first scale's ring, a copy: `(n_bins, H, W)` int32,
         the oldest bin first, not clipped.
         """
         return np.roll(self._state.counts, -1 - int(self._state.clock[CLOCK_SLOT]), axis=0)
 
+    @one_thread
     def activity(self) -> NDArray[np.int64]:
         """The sum of squared entries of every local volume of the first scale, a copy: `(rows, columns)`
         int64; 0 is empty.
@@ -301,6 +306,7 @@ class Engine(Shown):
             active, encoded = active + seen.active_volumes, encoded + seen.encoded_volumes
         return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
 
+    @one_thread
     def restart(self, origin_us: int) -> None:
         """Forget every event and start bin 0 at `origin_us`; what was counted so far stays counted.
 
@@ -319,6 +325,7 @@ class Engine(Shown):
         for _, scale in self._further:
             scale.restart(origin)
 
+    @one_thread
     def snapshot(self) -> Snapshot:
         """Copy the state. Projections and codes are not part of it: they follow from the counts.
 
@@ -346,6 +353,7 @@ class Engine(Shown):
             further=tuple(scale.snapshot() for _, scale in self._further),
         )
 
+    @one_thread
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of an engine with the same encoder and resolution.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.geometry import Geometry
+from streamfeat.engine.narrow import check_narrow, narrow_columns, with_narrow_codes
 from streamfeat.errors import InputError
 from streamfeat.kernels.layout import FEATURE_ENCODINGS, LANES, SPLIT, TRIANGLE, Operator
 
@@ -57,8 +58,12 @@ def quantise(
     mean: NDArray[np.float32],
     eps: float,
     gap: float,
+    *,
+    narrow: bool = False,
 ) -> Operator:
-    """Fold whitening and mean removal into one matrix of int16, with one scale for all filters.
+    """Fold whitening and mean removal into one matrix of int16.
+
+    There is one scale for all filters; in the narrow state one for each.
 
     Args:
         geometry: of the local volumes, `d` entries each.
@@ -68,6 +73,10 @@ def quantise(
         mean: `(d,)`.
         eps: added to the variance of a volume.
         gap: relative duality gap of the lasso.
+        narrow: for the narrow state.
+
+    Raises:
+        InputError: not for the narrow state, with the arithmetic.
     """
     k, d = filters.shape
     padded = -(-k // LANES) * LANES
@@ -76,9 +85,14 @@ def quantise(
     offset = projector @ mean
     # Mean removal: P (I - 1 1'/d).
     projector -= projector.mean(axis=1, keepdims=True)
-    scale = float(np.abs(projector).max()) / _INT16 or 1.0
+    scale, steps = float(np.abs(projector).max()) / _INT16 or 1.0, None
     columns = np.zeros((d, padded), np.int16)
     columns[:, :k] = np.rint(projector.T / scale)
+    if narrow:
+        if fixed["inverse"] or fixed["kind"] == TRIANGLE:
+            raise InputError("codes of the inverse formulation and of the triangle encoding need 32 bits")
+        scale = 1.0
+        columns, steps = narrow_columns(geometry, projector, padded)
     padded_offset = np.zeros(padded, np.float32)
     padded_offset[:k] = offset
     square_norms = np.zeros(padded, np.float32)
@@ -114,6 +128,8 @@ def quantise(
         reach=reach,
         square_norms=square_norms,
         gap=float(gap),
+        wide=None if narrow else True,
+        steps=steps,
     )
 
 
@@ -158,6 +174,10 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
         raise InputError("offset and square_norms must be finite")
     if form[0]:
         _check_form(geometry, operator)
+    if operator.steps is not None:
+        if form[0]:
+            raise InputError("only soft codes of the direct formulation have a narrow state")
+        check_narrow(geometry, operator)
     magnitude = np.abs(operator.columns.astype(np.int64))
     sums = geometry.max_count * int(magnitude.sum(axis=0).max())
     if sums > _INT32:
@@ -168,6 +188,8 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
         )
     columns = aligned_zeros(operator.columns.shape, np.int16)
     columns[:] = operator.columns
+    if operator.steps is not None:
+        return operator._replace(columns=columns)
     checked = operator._replace(largest=_largest_code(operator), columns=columns)
     _fixed_point_bits(checked, 1)
     return checked
@@ -214,6 +236,8 @@ def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operato
     """
     rows, columns = grid_shape
     volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling)
+    if operator.steps is not None:
+        return with_narrow_codes(operator, volumes)._replace(shape=grid_shape)
     unit = 2.0 ** _fixed_point_bits(operator, volumes)
     offset = operator.offset * np.float32(unit)
     offset.flags.writeable = False

@@ -15,6 +15,7 @@ from streamfeat.kernels.layout import (
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_START,
+    QUEUE,
     SPLIT,
     Operator,
     State,
@@ -53,7 +54,9 @@ def allocate_state(
     clock = np.zeros(7, np.int64)
     clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
     clock[CLOCK_ORIGIN] = origin_us
-    features = 2 * padded if operator.kind == SPLIT else padded
+    narrow = operator.steps is not None
+    numbers, queue = (np.int16, QUEUE) if narrow else (np.int32, 0)
+    features = 2 * padded if narrow or operator.kind == SPLIT else padded
     return State(
         counts=np.zeros(ring, np.int32),
         applied=np.zeros(ring, np.int16),
@@ -69,7 +72,7 @@ def allocate_state(
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
         encoded=np.zeros(threads, np.int64),
-        projections=aligned_zeros((planes, volumes, padded), np.int32),
+        projections=aligned_zeros((planes, volumes, padded), numbers),
         moments=np.zeros((planes, volumes, 4), np.int64),
         atoms=np.zeros((planes, volumes, 2, atoms), np.float64),
         pooled=aligned_zeros((planes, operator.pooling**2, features), np.int32),
@@ -79,7 +82,10 @@ def allocate_state(
         crowds=np.zeros((ring[1] + 1, columns), np.int32),
         dirty=np.zeros(planes * rows * columns, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
-        code=aligned_zeros((threads, 3, padded), np.int32),
+        code=aligned_zeros((threads, 2, padded), np.int32),
+        sums=aligned_zeros((threads, queue + 1, padded), numbers),
+        queue=np.zeros((threads, queue, 3), np.int64),
+        queued=np.zeros((threads, 4), np.int64),
         work=np.zeros((threads, 5, padded), np.float64),
         active=np.zeros((threads, padded), np.int64),
         values=aligned_zeros((threads, 2, -(-geometry.entries // MASK_BITS) * MASK_BITS), np.int16),

@@ -1,18 +1,25 @@
 """Threads that share the work of one large emission.
 
-Lives here: how many an engine uses, how many a piece of work is worth, and handing out its parts.
+Lives here: how many an engine uses, that one alone calls it, how many a piece of work is worth, and
+handing out its parts.
 Not here: what the work is (`kernels.update`, `kernels.planes`); threads that wait for files or for the
 network.
 """
 
+import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from threading import RLock
+from typing import ParamSpec, TypeVar
 
 from streamfeat.errors import InputError
 from streamfeat.kernels.layout import Operator, State
 
-__all__ = ["MOST_THREADS", "Crew", "usable_threads"]
+__all__ = ["MOST_THREADS", "Crew", "one_thread", "usable_threads"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 MOST_THREADS = 256
 
@@ -41,11 +48,33 @@ def usable_threads(threads: int | None = None) -> int:
     return threads
 
 
+def one_thread(method: Callable[P, T]) -> Callable[P, T]:
+    """A method of what has a `_crew`, that refuses to run while another thread is in one.
+
+    An engine that is shared by mistake would go on with wrong counts, and nothing would tell.
+    """
+
+    @functools.wraps(method)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> T:
+        turn = args[0]._crew.turn  # type: ignore[attr-defined]
+        if not turn.acquire(blocking=False):
+            raise RuntimeError("an engine is used by two threads at once; give each its own")
+        try:
+            return method(*args, **kwargs)
+        finally:
+            turn.release()
+
+    return guarded
+
+
 class Crew:
     """The calling thread and some others; those start with the first large piece of work.
 
     Args:
         threads: how many, with the calling one.
+
+    Attributes:
+        turn: held by the calling thread as long as it works.
 
     Raises:
         InputError: they are not 1 to 256.
@@ -53,6 +82,7 @@ class Crew:
 
     def __init__(self, threads: int) -> None:
         """Start nothing yet; the threads end with this object."""
+        self.turn = RLock()
         self.threads = usable_threads(threads)
         self._others = ThreadPoolExecutor(threads - 1, "streamfeat-engine") if threads > 1 else None
 

@@ -31,8 +31,8 @@ _DESCRIPTORS = re.compile(r"/dev/(?:stdin|stdout|stderr)|(?:/dev|/proc/self)/fd/
 _STANDARD = {"stdin": 0, "stdout": 1, "stderr": 2}
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write `data` to `path`, on disk before an earlier file is replaced.
+def write_atomically(path: Path, data: bytes, *, private: bool = False) -> None:
+    """Write `data` to `path`, on disk before an earlier file is replaced; `private` ones for this user alone.
 
     Raises:
         InputError: it cannot be written, for lack of room or of permission; an earlier file is as it was.
@@ -44,7 +44,7 @@ def write_atomically(path: Path, data: bytes) -> None:
             with target.open("wb") if number is None else os.fdopen(os.dup(number), "wb") as file:
                 file.write(data)
             return
-        with _replacing(path, target) as temporary, temporary.open("wb") as file:
+        with _replacing(path, target, private) as temporary, temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -117,7 +117,7 @@ def followed(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _replacing(path: Path, target: Path) -> Iterator[Path]:
+def _replacing(path: Path, target: Path, private: bool) -> Iterator[Path]:
     """A temporary path beside `target` that takes its place when the block ends without an error."""
     try:
         handle, name = tempfile.mkstemp(_SUFFIX, f".{target.name}.", target.parent)
@@ -127,7 +127,7 @@ def _replacing(path: Path, target: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
+        temporary.chmod(0o600 if private else 0o666 & ~_umask())
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)

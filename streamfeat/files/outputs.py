@@ -24,6 +24,7 @@ except ImportError:  # a system without locks of this kind: two writers of one o
 __all__ = ["OutputFile", "locked_file"]
 
 _WAIT_S, _TURN_S = 10, 0.02
+_FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 
 class OutputFile:
@@ -43,7 +44,9 @@ class OutputFile:
         part: the file that is written, None for devices and pipes.
     """
 
-    def __init__(self, path: Path, *, suffix: str = ".part", keep_leftover: bool = False) -> None:
+    def __init__(
+        self, path: Path, *, suffix: str = ".part", keep_leftover: bool = False, private: bool = False
+    ) -> None:
         """Open and lock the part.
 
         Args:
@@ -51,6 +54,7 @@ class OutputFile:
             suffix: what the part's name has after that of the output.
             keep_leftover: refuse to begin where a writer that was killed has left a part with something in
                 it; it is overwritten otherwise.
+            private: for this user's eyes alone, where a new file otherwise has the permissions of any other.
 
         Raises:
             InputError: it is a folder or a link to nothing, its folder is not there, another writer is at
@@ -62,7 +66,7 @@ class OutputFile:
             self._target = followed(path)
             if is_replaced(path):
                 self.part = self._target.with_name(self._target.name + suffix)
-                self.file = locked_file(self.part, path)
+                self.file = locked_file(self.part, path, private=private)
             else:
                 self.file = _opened_as_it_is(path)
         except OSError as error:
@@ -118,7 +122,7 @@ class OutputFile:
             self.file.close()
 
 
-def locked_file(path: Path, output: Path | None = None) -> BinaryIO:
+def locked_file(path: Path, output: Path | None = None, *, private: bool = False) -> BinaryIO:
     """A file to read and write, from its start, with what is in it; empty if it was not there.
 
     It is locked until it is closed, or its process ends.
@@ -126,13 +130,14 @@ def locked_file(path: Path, output: Path | None = None) -> BinaryIO:
     Args:
         path: of the file.
         output: what to name where it cannot be opened, if not the file itself.
+        private: readable by this user alone, if it was not there.
 
     Raises:
         InputError: another writer has it, or it cannot be opened.
     """
     while True:
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+            descriptor = os.open(path, _FLAGS, 0o600 if private else 0o666)
         except OSError as error:
             raise InputError(f"{output or path}: cannot write there: {error.strerror}") from None
         file = os.fdopen(descriptor, "r+b")

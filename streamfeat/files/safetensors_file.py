@@ -21,13 +21,28 @@ __all__ = ["one_line", "read_safetensors", "write_safetensors"]
 
 
 def write_safetensors(
-    path: Path, kind: str, version: int, arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]
+    path: Path,
+    kind: str,
+    version: int,
+    arrays: Mapping[str, NDArray[Any]],
+    header: Mapping[str, Any],
+    *,
+    private: bool = False,
 ) -> None:
-    """Write arrays and a JSON header as one file, which appears whole or not at all."""
+    """Write arrays and a JSON header as one file, which appears whole or not at all.
+
+    Args:
+        path: replaced if it exists.
+        kind: what it is.
+        versions: of its format, of which it must be one.
+        arrays: by name.
+        header: JSON values.
+        private: readable by this user alone.
+    """
     # safetensors writes the buffer of an array as it lies, so a transposed view would come back scrambled.
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     text = json.dumps({"format": kind, "version": version, **header})
-    write_atomically(path, save(contiguous, metadata={"streamfeat": text}))
+    write_atomically(path, save(contiguous, metadata={"streamfeat": text}), private=private)
 
 
 def one_line(error: BaseException) -> str:
@@ -37,17 +52,17 @@ def one_line(error: BaseException) -> str:
 
 
 def read_safetensors(
-    path: Path, kind: str | tuple[str, ...], version: int
+    path: Path, kind: str | tuple[str, ...], *versions: int
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read all arrays of a safetensors file and the JSON header that streamfeat keeps with them.
 
     Args:
         path: the file.
         kind: what it must be, or several kinds of which it must be one.
-        version: of its format.
+        versions: of its format, of which it must be one.
 
     Raises:
-        InputError: the file cannot be read, or its header is not of this kind and version.
+        InputError: the file cannot be read, or its header is not of this kind and one of these versions.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -68,9 +83,10 @@ def read_safetensors(
     kinds = (kind,) if isinstance(kind, str) else kind
     if not isinstance(header, dict) or header.get("format") not in kinds:
         raise InputError(f"{path}: a safetensors file, but not a {kinds[0]} file")
-    if header.get("version") != version:
+    if header.get("version") not in versions:
         raise InputError(
-            f"{path}: format version {header.get('version')!r}, this streamfeat reads version {version}; "
+            f"{path}: format version {header.get('version')!r}, this streamfeat reads version "
+            f"{' and '.join(map(str, versions))}; "
             "make the file again"
         )
     return arrays, header

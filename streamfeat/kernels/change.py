@@ -5,6 +5,7 @@ Not here: counting it (`ingest`), the events of a stream (`follow`), many change
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from streamfeat.kernels.code import deviation, gain, move_code, move_triangle, whitened_square
 from streamfeat.kernels.compiled import inlined, kernel
@@ -20,6 +21,7 @@ from streamfeat.kernels.layout import (
     Operator,
     State,
 )
+from streamfeat.kernels.narrow import move_queued, queue_volume
 from streamfeat.kernels.volume import change_entries, change_moments, gather_volume, sum_columns
 
 ONCE, NO_THREAD = np.int64(1), np.int64(0)
@@ -50,7 +52,7 @@ def change_volume(plane: int, volume: int, n: int, part: int, operator: Operator
         operator,
         state.projections[plane, volume],
         state.moments[plane, volume],
-        state.code[part, 2],
+        state.sums[part, 0],
     )
     if coded:
         pool_volume(plane, volume, volume, ADD, part, operator, state)
@@ -74,7 +76,7 @@ def move_volume(plane: int, volume: int, n: int, part: int, operator: Operator, 
     after = deviation(moments, d, eps)
     before_after = gain(sigma, operator), gain(after, operator)
     if operator.kind == TRIANGLE:
-        total = state.code[part, 2]
+        total = state.sums[part, 0]
         sum_columns(n, entries, changes, operator.columns, total)
         move_triangle(
             ONCE,
@@ -105,7 +107,7 @@ def move_volume(plane: int, volume: int, n: int, part: int, operator: Operator, 
                 sums,
             )
         else:
-            total = state.code[part, 2]
+            total = state.sums[part, 0]
             sum_columns(n, entries, changes, operator.columns, total)
             move_code(
                 ONCE, total, projection, before_after[0], before_after[1], offset, threshold, kind, sums
@@ -114,20 +116,50 @@ def move_volume(plane: int, volume: int, n: int, part: int, operator: Operator, 
 
 
 @inlined
-def follow_changes(plane: int, volume: int, n: int, part: int, operator: Operator, state: State) -> None:
+def follow_changes(
+    narrow: NDArray[np.uint16] | None,
+    wide: bool | None,
+    plane: int,
+    volume: int,
+    n: int,
+    part: int,
+    operator: Operator,
+    state: State,
+) -> None:
     """Let listed entries of a volume change, in the shortest way.
 
-    Args: as for `change_volume`.
+    Args: as for `change_volume`, after the states (see `encode.write_code`). In the narrow state the
+        volume may wait in the queue: `follow_rest` has to be called behind the last.
     """
     squares = state.moments[plane, volume, MOMENT_SQUARES]
     after = squares
     for i in range(n):
         change = np.int64(state.changes[part, i])
         after += change * (2 * np.int64(state.values[part, 0, state.entries[part, i]]) + change)
-    if volume < state.cursors[plane, CURSOR_CODED] and not operator.inverse and squares != 0 and after != 0:
-        move_volume(plane, volume, n, part, operator, state)
-    else:
+    closed = volume < state.cursors[plane, CURSOR_CODED] and squares != 0 and after != 0
+    if narrow is not None:  # noqa: SIM102 - see `encode.write_code`
+        if closed:
+            queue_volume(plane, volume, n, part, operator, state)
+    if wide is not None:
+        closed = closed and not operator.inverse
+        if closed:
+            move_volume(plane, volume, n, part, operator, state)
+    if not closed:
         change_volume(plane, volume, n, part, operator, state)
+
+
+@inlined
+def follow_rest(narrow: NDArray[np.uint16] | None, part: int, operator: Operator, state: State) -> None:
+    """Let no volume wait in the queue.
+
+    Args:
+        narrow: `operator.upper` (see `encode.write_code`).
+        part: whose queue.
+        operator: the encoder.
+        state: as for `narrow.move_queued`.
+    """
+    if narrow is not None:
+        move_queued(part, operator, state)
 
 
 @inlined
@@ -171,5 +203,6 @@ def change_place(position: int, row: int, column: int, operator: Operator, state
                     values[end:] = 0
                 values[entry] = before
                 state.entries[0, 0], state.changes[0, 0] = entry, after - before
-                follow_changes(plane, volume, ONCE, NO_THREAD, operator, state)
+                follow_changes(operator.upper, operator.wide, plane, volume, ONCE, NO_THREAD, operator, state)
+    follow_rest(operator.upper, NO_THREAD, operator, state)
     state.applied[slot, row, column] = after

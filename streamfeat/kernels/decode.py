@@ -1,21 +1,25 @@
 """Packet words to events, and the span of time that a packet's events cover.
 
-Lives here: the encodings of 16-bit words, where each depends on the ones before it, and `mono`, where one
-pass takes a fifth of the time of a pass for each field; one short loop each, writing to `out`.
-Not here: payload checks, capacity, and the encoding that NumPy reads by itself (`libcaer`); see
-`streamfeat.messages.codecs`.
+Lives here: the four encodings, one short loop each, writing to `out`. Where each event has a record of its
+own, its time is compared on the way; of 16-bit words that is another pass, over the events.
+Not here: payload checks and capacity; see `streamfeat.messages.codecs`.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.events import Events
+from streamfeat.events import TIME_LIMIT, Events
 from streamfeat.kernels.compiled import kernel
 
-__all__ = ["decode_evt3", "decode_libcaer_cmp", "decode_mono", "time_span"]
+__all__ = ["decode_evt3", "decode_libcaer", "decode_libcaer_cmp", "decode_mono", "place_events", "time_span"]
 
 # A TIME_HIGH that goes back by less than half of its 12 bits is late or has a flipped bit; by more, a wrap.
 TIME_HIGH_BACKSTEP = 0x7FF
+
+LIBCAER_WRAP_US = 1 << 31
+
+EARLIEST, LATEST = np.int64(-0x7FFF_FFFF_FFFF_FFFF - 1), np.int64(0x7FFF_FFFF_FFFF_FFFF)
+"""What no time of an event is beyond."""
 
 
 @kernel
@@ -122,20 +126,93 @@ def decode_libcaer_cmp(words: NDArray[np.uint16], base_us: int, state: NDArray[n
 
 
 @kernel
-def decode_mono(words: NDArray[np.uint64], base_us: int, rest_ns: int, out: Events) -> None:
-    """Decode mono words.
+def decode_mono(
+    words: NDArray[np.uint64],
+    base_us: int,
+    rest_ns: int,
+    height: int,
+    width: int,
+    out: NDArray[np.int64],
+    span: NDArray[np.int64],
+) -> int:
+    """Decode mono words, and find the span of their times on the way, as `time_span` does.
 
     Args:
         words: `(n,)` uint64, not changed.
         base_us: time of the packet, whole microseconds.
         rest_ns: what the time of the packet has beyond those, 0 to 999 ns.
-        out: `(n,)` `EVENT_DTYPE`, changed.
+        height: of the sensor, pixels.
+        width: of the sensor, pixels.
+        out: `(2 n,)` int64, changed: the memory of `n` events.
+        span: as of `time_span`.
+
+    Returns:
+        How many events are on the sensor.
     """
-    for i, word in enumerate(words):
-        out[i].x = (word >> 32) & 0xFFFF
-        out[i].y = (word >> 48) & 0x7FFF
-        out[i].p = word >> 63
-        out[i].t = base_us + (rest_ns + np.int64(word & 0xFFFFFFFF)) // 1000
+    n = 0
+    first, last = LATEST, EARLIEST
+    for i in range(words.shape[0]):
+        word = words[i]
+        dt_ns = word & np.uint64(0xFFFFFFFF)
+        # Division of 32 bits by 1000 (Granlund and Montgomery 1994): a product, for vectors have no other.
+        dt_us = (dt_ns * np.uint64(274877907)) >> np.uint64(38)
+        ns = np.int64(dt_ns - dt_us * np.uint64(1000)) + rest_ns
+        t = base_us + np.int64(dt_us) + np.int64(ns >= 1000)
+        pixel = (word >> np.uint64(32)) & np.uint64(0x7FFFFFFF)
+        out[2 * i] = np.int64(pixel | (word >> np.uint64(63)) << np.uint64(32))
+        out[2 * i + 1] = t
+        if np.int64(pixel & np.uint64(0xFFFF)) < width and np.int64(pixel >> np.uint64(16)) < height:
+            first, last = min(first, t), max(last, t)
+            n += 1
+    if n:
+        span[0], span[1] = first, last
+    return n
+
+
+@kernel
+def decode_libcaer(
+    words: NDArray[np.uint64],
+    base_us: int,
+    height: int,
+    width: int,
+    out: NDArray[np.int64],
+    span: NDArray[np.int64],
+) -> int:
+    """Decode libcaer records, and find the span of their times on the way, as `time_span` does.
+
+    Microseconds wrap at 31 bits within a packet: only a fall of more than half of that is a wrap, a smaller
+    one is an event out of order.
+
+    Args:
+        words: `(n,)` uint64, not changed: address and polarity in the lower 32 bits, microseconds above.
+        base_us: time of the packet, microseconds.
+        height: of the sensor, pixels.
+        width: of the sensor, pixels.
+        out: `(2 n,)` int64, changed: the memory of `n` events.
+        span: as of `time_span`.
+
+    Returns:
+        How many events are on the sensor.
+    """
+    n = 0
+    first, last = LATEST, EARLIEST
+    turn_us, before_us = base_us, np.int64(0)
+    for i in range(words.shape[0]):
+        word = np.int64(words[i] & np.uint64(0x7FFFFFFF_FFFFFFFF))
+        us = word >> 32
+        if us - before_us < -(LIBCAER_WRAP_US // 2):
+            turn_us += LIBCAER_WRAP_US
+        before_us = us
+        t = turn_us + us
+        x, y, p = word >> 17 & 0x7FFF, word >> 2 & 0x7FFF, word >> 1 & 1
+        out[2 * i] = x | y << 16 | p << 32
+        out[2 * i + 1] = t
+        if x < width and y < height:
+            first, last = min(first, t), max(last, t)
+            n += 1
+    if n:
+        span[0], span[1] = first, last
+    return n
 
 
 @kernel
@@ -152,11 +229,50 @@ def time_span(events: Events, height: int, width: int, span: NDArray[np.int64]) 
         How many events are on the sensor.
     """
     n = 0
-    first, last = np.int64(0x7FFF_FFFF_FFFF_FFFF), np.int64(-0x7FFF_FFFF_FFFF_FFFF - 1)
+    first, last = LATEST, EARLIEST
     for i in range(len(events)):
         if events[i].x < width and events[i].y < height:
             first, last = min(first, events[i].t), max(last, events[i].t)
             n += 1
+    if n:
+        span[0], span[1] = first, last
+    return n
+
+
+@kernel
+def place_events(
+    events: Events,
+    height: int,
+    width: int,
+    reached_us: int,
+    latest: NDArray[np.int64],
+    span: NDArray[np.int64],
+) -> int:
+    """Find stream time after each event: it never goes back, and events that cannot be used have no say.
+
+    Args:
+        events: `(n,)` `EVENT_DTYPE`, not changed.
+        height: of the sensor, pixels.
+        width: of the sensor, pixels.
+        reached_us: stream time before the first event.
+        latest: `(n,)` int64, overwritten: stream time after each event.
+        span: `(2,)` int64, changed: earliest and latest time of the events that can be used; as it was where
+            none can.
+
+    Returns:
+        How many events can be used, see `events.is_valid`.
+    """
+    n = 0
+    first, last = LATEST, EARLIEST
+    now = np.int64(reached_us)
+    for i in range(events.shape[0]):
+        event = events[i]
+        t = event.t
+        inside = event.x < width and event.y < height
+        if inside and event.p >> 1 == 0 and -TIME_LIMIT < t < TIME_LIMIT:
+            first, last, now = min(first, t), max(last, t), max(now, t)
+            n += 1
+        latest[i] = now
     if n:
         span[0], span[1] = first, last
     return n

@@ -1,23 +1,19 @@
-"""Events read one by one: what is pooled is current after every single event.
+"""Events followed one by one: what is pooled is current after every single event.
 
-Lives here: the kernel that runs for each event under `--emit event`.
-Not here: what one changed entry does to volumes (`change`); events that are only counted (`ingest`).
+Lives here: what each event does under `--emit event`.
+Not here: what one changed entry does to volumes (`change`); events that are only counted (`ingest`); what is
+read after each event (`trace`).
 """
-
-import numpy as np
-from numpy.typing import NDArray
 
 from streamfeat.events import Events
 from streamfeat.kernels.change import change_place
 from streamfeat.kernels.compiled import inlined, kernel
-from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.ingest import UNCHANGED, count_event
 from streamfeat.kernels.layout import (
     CLOCK_PLANE,
     CLOCK_START,
     CURSOR_CODED,
     CURSOR_PROJECTED,
-    TALLY_EVENTS,
     Operator,
     State,
 )
@@ -79,27 +75,3 @@ def follow(events: Events, operator: Operator, state: State) -> None:
     for i in range(events.shape[0]):
         event = events[i]
         follow_event(event.x, event.y, event.p, event.t, operator, state)
-
-
-@kernel
-def trace(
-    events: Events,
-    operator: Operator,
-    state: State,
-    features: NDArray[np.float32],
-    accepted: NDArray[np.int64],
-) -> None:
-    """Follow every event of a batch, and read the features after each.
-
-    Args:
-        events: `(n,)` EVENT_DTYPE, any content; not changed.
-        operator: the encoder.
-        state: as for `follow_event`.
-        features: `(n, 4 K)` or `(n, 8 K)`, overwritten.
-        accepted: `(n,)`, overwritten: events accepted so far.
-    """
-    for i in range(events.shape[0]):
-        event = events[i]
-        follow_event(event.x, event.y, event.p, event.t, operator, state)
-        read_features(operator, state, features[i])
-        accepted[i] = state.tally[TALLY_EVENTS]

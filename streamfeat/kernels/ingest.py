@@ -32,6 +32,9 @@ from streamfeat.kernels.vectors import prefetch
 SOON = 16
 """Pixels of events lie anywhere in a ring that caches may not hold: loaded this many events ahead."""
 
+IN_CACHE = 1 << 20
+"""Numbers of a ring that caches hold, so that nothing need be loaded ahead."""
+
 UNCHANGED = -1
 """Instead of the position of a bin: no clipped count changed."""
 
@@ -121,9 +124,9 @@ def slot_of(position: int, state: State) -> int:
 
 
 @inlined
-def start_of_bin(state: State) -> int:
-    """When the current bin began; before all time, later than any event."""
-    return int(state.clock[CLOCK_START]) if state.clock[CLOCK_NOW] > BEFORE_TIME else TIME_LIMIT
+def bin_length(operator: Operator, state: State) -> np.uint64:
+    """How long the current bin is; before all time there is none, and it has no length."""
+    return np.uint64(operator.bin_us if state.clock[CLOCK_NOW] > BEFORE_TIME else 0)
 
 
 @kernel
@@ -140,37 +143,47 @@ def count_events(events: Events, operator: Operator, state: State) -> None:
     counts, flags = state.counts.reshape(-1), state.is_touched.reshape(-1)
     touched, tally, limit, clock = state.touched, state.tally, operator.max_count, state.clock
     rows, columns = state.ring_rows, state.ring_columns
+    height, width = rows.shape[0], columns.shape[0]
     row_length, slot_length = state.counts.shape[2], state.counts.shape[1] * state.counts.shape[2]
-    start, first = start_of_bin(state), clock[CLOCK_SLOT] * slot_length
-    n_touched, n_saturated = clock[CLOCK_TOUCHED], 0
+    start, length, first = clock[CLOCK_START], bin_length(operator, state), clock[CLOCK_SLOT] * slot_length
+    n_touched, n_saturated, n_counted = clock[CLOCK_TOUCHED], 0, 0
+    is_far, last = counts.shape[0] > IN_CACHE, events.shape[0] - 1
     for i in range(events.shape[0]):
-        event = events[min(i + SOON, events.shape[0] - 1)]
-        x, y = min(int(event.x), columns.shape[0] - 1), min(int(event.y), rows.shape[0] - 1)
-        later = first + np.int64(rows[y]) * row_length + columns[x]
-        prefetch(counts, later)
-        prefetch(flags, later)
+        if is_far:
+            event = events[min(i + SOON, last)]
+            x, y = min(int(event.x), width - 1), min(int(event.y), height - 1)
+            later = first + np.int64(rows[y]) * row_length + columns[x]
+            prefetch(counts, later)
+            prefetch(flags, later)
         event = events[i]
         x, y, p, t = event.x, event.y, event.p, event.t
-        if is_valid(x, y, p, t, state) and np.uint64(t - start) < np.uint64(operator.bin_us):
+        # As `is_valid`: no time of the current bin is beyond all limits.
+        if x < width and y < height and np.uint16(p) < 2 and np.uint64(t - start) < length:
             # Unsigned, or every index would be tested for being below zero.
             place = np.uint64(first + rows[y] * row_length + columns[x])
             before = counts[place]
             after = before + 2 * p - 1
             counts[place] = after
             changed = min(max(before, -limit), limit) != min(max(after, -limit), limit)
-            tally[TALLY_EVENTS] += 1
+            n_counted += 1
             n_saturated += not changed
             # Always on the stack, and kept or not: whether a count saturates cannot be predicted.
             touched[np.uint64(n_touched)] = place
-            n_touched += changed & (flags[place] == 0)
-            flags[place] |= changed
+            flag = flags[place]
+            n_touched += changed & (flag == 0)
+            flags[place] = flag | changed
             continue
         position, row, column = count_event(x, y, p, t, operator, state)
-        start, first = start_of_bin(state), clock[CLOCK_SLOT] * slot_length
+        start, length, first = (
+            clock[CLOCK_START],
+            bin_length(operator, state),
+            clock[CLOCK_SLOT] * slot_length,
+        )
         if position != UNCHANGED:
             other = slot_of(position, state) * slot_length + row * row_length + column
             touched[n_touched] = other
             n_touched += flags[other] == 0
             flags[other] = 1
     clock[CLOCK_TOUCHED] = n_touched
+    tally[TALLY_EVENTS] += n_counted
     tally[TALLY_SATURATED] += n_saturated

@@ -14,6 +14,9 @@ from streamfeat.events import TIME_LIMIT
 SOFT, SPLIT, TRIANGLE = 0, 1, 2
 FEATURE_ENCODINGS = {"soft": SOFT, "split": SPLIT, "triangle": TRIANGLE}
 
+QUEUE = 16
+"""Volumes that wait at most: their sums of columns stay in the first cache."""
+
 LANES = 32
 """Filters are padded with zeros to a multiple of this, so that no vector loop has a tail."""
 
@@ -67,6 +70,18 @@ class Operator(NamedTuple):
     """The lasso stops at this duality gap, relative to `1/2 |x|^2`."""
     shape: tuple[int, int] = (0, 0)
     """Rows and columns of the grid of volumes; of the sensor, not of the model, which has none."""
+    wide: bool | None = True
+    """None in the narrow state, as `steps`, `upper` and `lower` are in the wide one: a kernel is compiled
+    for the state that it is called with, and for no other."""
+    steps: NDArray[np.float64] | None = None
+    """`(Kp,)`: `P[k] = steps[k] * columns[:, k]` in the narrow state, where `scale` means nothing; of a
+    sensor, what a code of one is worth."""
+    upper: NDArray[np.uint16] | None = None
+    """`(Kp,)`: positive codes are what is above it, 2^15 standing for zero; narrow state, of a sensor."""
+    lower: NDArray[np.uint16] | None = None
+    """`(Kp,)`: negative codes are what is below it."""
+    gain: float = 0.0
+    """Units of a code in a projection that is divided by the deviation; narrow state, of a sensor."""
 
 
 class State(NamedTuple):
@@ -111,8 +126,8 @@ class State(NamedTuple):
     """`(5,)`: see the TALLY_* slots."""
     encoded: NDArray[np.int64]
     """`(N,)`: volumes encoded so far, a measure of the work done."""
-    projections: NDArray[np.int32]
-    """`(planes, V, Kp)`: `q` of every volume."""
+    projections: NDArray[np.int32] | NDArray[np.int16]
+    """`(planes, V, Kp)`: `q` of every volume; int16 in the narrow state."""
     moments: NDArray[np.int64]
     """`(planes, V, 4)`: sum of entries, sum of squares, quadratic form, linear form, of every volume."""
     atoms: NDArray[np.float64]
@@ -120,7 +135,8 @@ class State(NamedTuple):
     response, the Gram matrix times the code."""
     pooled: NDArray[np.int32]
     """`(planes, cells, F)`: fixed-point codes summed over each cell. `F` is Kp, or 2 Kp for SPLIT: sums of
-    codes, then of their absolute values (the positive and negative parts are half the sum and difference)."""
+    codes, then of their absolute values (the positive and negative parts are half the sum and difference). In
+    the narrow state 2 Kp: sums of positive parts, then of negative ones."""
     partial: NDArray[np.int32]
     """`(N - 1, planes, cells, F)`: what other parts than the first add to `pooled`, until all are done; then
     zero."""
@@ -136,7 +152,15 @@ class State(NamedTuple):
     is_dirty: NDArray[np.uint8]
     """`(planes * V,)`: whether a volume is on that stack because entries of it changed."""
     code: NDArray[np.int32]
-    """`(N, 3, Kp)`: scratch, fixed-point codes of one volume, and the change of a projection."""
+    """`(N, 2, Kp)`: scratch, fixed-point codes of one volume."""
+    sums: NDArray[np.int32] | NDArray[np.int16]
+    """`(N, Q + 1, Kp)`: scratch, sums of columns, as wide as projections are; the first row is that of a
+    volume which does not wait."""
+    queue: NDArray[np.int64]
+    """`(N, Q, 3)`: volumes that wait to move together: where the column begins, where the projection does,
+    and the gains before and after; narrow state."""
+    queued: NDArray[np.int64]
+    """`(N, 4)`: see the QUEUED_* slots; no volume waits between two calls."""
     work: NDArray[np.float64]
     """`(N, 5, Kp)`: scratch of the lasso."""
     active: NDArray[np.int64]
@@ -159,11 +183,19 @@ CURSOR_CODED, CURSOR_PROJECTED, CURSOR_ENTRY = range(3)
 """Volumes below the first have a code in the plane, those below the second a projection; of the volume at the
 second, the entries below the third are in its projection."""
 
+QUEUED_VOLUMES, QUEUED_PLANE, QUEUED_CELL, QUEUED_SIGN = range(4)
+"""How many volumes wait; their plane; their cell; whether their columns are added (1) or subtracted (-1) as
+they are, or were summed (0)."""
+
 TALLY_EVENTS, TALLY_LATE, TALLY_REJECTED, TALLY_SATURATED, TALLY_ROLLS = range(5)
 """Accepted; older than the window; outside the sensor or malformed; no change of a clipped count; bins
 moved on by."""
 
 MOMENT_SUM, MOMENT_SQUARES, MOMENT_QUADRATIC, MOMENT_LINEAR = range(4)
+
+MOST_CODE = 2**13 - 1
+"""No code of the narrow state is larger, nor what it is before the threshold: so a projection times 2^shift
+fits into 16 bits."""
 
 BEFORE_TIME = -TIME_LIMIT
 """The current bin of an engine that has seen nothing, and when it began."""

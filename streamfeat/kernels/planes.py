@@ -83,7 +83,7 @@ def project_volume(
             sum_columns(n, entries, changes, operator.columns, projection)
         moments[:] = 0
     else:
-        sums = state.code[part, 2]
+        sums = state.sums[part, 0]
         sum_columns(n, entries, changes, operator.columns, sums)
         for k in range(sums.shape[0]):
             projection[k] += sums[k]
@@ -93,6 +93,23 @@ def project_volume(
     else:
         add_moments(n, changes, moments)
     return n, following
+
+
+@inlined
+def enter_atoms(wide: bool | None, plane: int, row: int, part: int, operator: Operator, state: State) -> None:
+    """Let the lasso of a volume start from the code that is kept of it.
+
+    Args:
+        wide: of the operator (see `encode.write_code`).
+        plane: which plane.
+        row: of the volume.
+        part: whose scratch to use.
+        operator: the encoder.
+        state: `atoms` and scratch are changed.
+    """
+    if wide is not None:  # noqa: SIM102 - see `encode.write_code`
+        if operator.inverse:
+            respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
 
 
 @kernel
@@ -113,8 +130,7 @@ def enter_code(plane: int, volume: int, part: int, operator: Operator, state: St
     if state.moments[plane, row, MOMENT_SQUARES] == 0:
         state.atoms[plane, row] = 0
         return False
-    if operator.inverse:
-        respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
+    enter_atoms(operator.wide, plane, row, part, operator, state)
     pool_volume(plane, row, volume, ADD, part, operator, state)
     return True
 

@@ -11,7 +11,7 @@ In steps, because threads can share two of them: `mark_dirty`, `renew` each part
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.kernels.change import follow_changes
+from streamfeat.kernels.change import follow_changes, follow_rest
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.ingest import slot_of
@@ -33,8 +33,8 @@ SOON = 16
 """Touched entries lie anywhere in a ring that caches may not hold: loaded this many ahead of their turn."""
 
 
-LINE = 16
-"""Numbers of a projection that a line of the cache holds."""
+CACHE_LINE = 64
+"""Bytes of a line of the cache."""
 
 
 @kernel
@@ -113,9 +113,10 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
     first_bin, last_bin = touched_bins(state)
     first, last = share_of(part, parts, state)
     rows, width = state.projections.reshape(-1), state.projections.shape[2]
+    line = CACHE_LINE // state.projections.itemsize
     for i in range(first, last):
         following = np.int64(state.dirty[min(i + 1, last - 1)]) * width
-        for k in range(following, following + width, LINE):
+        for k in range(following, following + width, line):
             prefetch(rows, k)
         plane, volume = np.int64(state.dirty[i]) // n_volumes, np.int64(state.dirty[i]) % n_volumes
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
@@ -132,7 +133,8 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
         else:
             gather_volume(state.applied, slot, start, stop, top, left, patch, values)
         n = list_entries(news, start, stop, state.entries[part], state.changes[part])
-        follow_changes(plane, volume, n, part, operator, state)
+        follow_changes(operator.upper, operator.wide, plane, volume, n, part, operator, state)
+    follow_rest(operator.upper, part, operator, state)
 
 
 @kernel

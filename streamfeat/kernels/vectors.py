@@ -1,49 +1,39 @@
 """Short vector code that a loop in Python cannot be made to compile to.
 
-Lives here: four functions written in LLVM's own terms, each for a line or a block of int16 numbers.
+Lives here: functions written in LLVM's own terms, each for a line or a block of numbers.
 Not here: what the numbers mean (`volume`).
 
 The code names no processor. LLVM finds the instruction: products of pairs and their sum are `vpdpwssd` with
 AVX-512 VNNI, `vpmaddwd` with AVX2, `pmaddwd` with SSE2, and plain multiplications elsewhere. All of them
-are exact, so the bits are the same everywhere.
+are exact, so the bits are the same everywhere. Floats are summed in an order that is written down.
 """
 
 from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 
+from streamfeat.kernels.assembly import (
+    BLOCK,
+    I1,
+    I16,
+    I32,
+    I64,
+    in_blocks,
+    int64,
+    load,
+    order,
+    place,
+    product_of_pairs,
+    repeat,
+    splat,
+)
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_pairs"]
+__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_listed", "sum_products"]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
-
-BLOCK, WIDEST = 32, 3
-"""Filters in one vector of `sum_pairs`, and vectors in a block: their sums have to fit into registers."""
-
-_I1, _I16, _I32, _I64 = ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntType(64)
-
-
-def _int64(value: int) -> ir.Constant:
-    return ir.Constant(_I64, value)
-
-
-def _order(indices: list[int]) -> ir.Constant:
-    return ir.Constant(ir.VectorType(_I32, len(indices)), indices)
-
-
-def _place(builder: Any, array: Any, index: Any, kind: Any) -> Any:
-    """Pointer to a vector that starts at an element of an array."""
-    return builder.bitcast(builder.gep(array.data, [index]), kind.as_pointer())
-
-
-def _load(builder: Any, array: Any, index: Any, kind: Any, align: int = 2) -> Any:
-    loaded = builder.load(_place(builder, array, index, kind))
-    loaded.align = align
-    return loaded
 
 
 @generated
@@ -53,10 +43,10 @@ def copy_eight(typing: Any, source: Any, start: Any, target: Any, to: Any) -> An
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         source, start, target, to = arguments
         kinds = signature.args
-        vector = ir.VectorType(_I16, EIGHT)
-        numbers = _load(builder, context.make_array(kinds[0])(context, builder, source), start, vector)
-        place = _place(builder, context.make_array(kinds[2])(context, builder, target), to, vector)
-        builder.store(numbers, place).align = 2
+        vector = ir.VectorType(I16, EIGHT)
+        numbers = load(builder, context.make_array(kinds[0])(context, builder, source), start, vector)
+        there = place(builder, context.make_array(kinds[2])(context, builder, target), to, vector)
+        builder.store(numbers, there).align = 2
         return context.get_dummy_value()
 
     return types.void(source, types.int64, target, types.int64), generate
@@ -68,10 +58,10 @@ def filled_mask(typing: Any, values: Any, start: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        vector = ir.VectorType(_I16, MASK_BITS)
-        numbers = _load(builder, array, arguments[1], vector)
+        vector = ir.VectorType(I16, MASK_BITS)
+        numbers = load(builder, array, arguments[1], vector)
         filled = builder.icmp_unsigned("!=", numbers, ir.Constant(vector, None))
-        return builder.bitcast(filled, _I64)
+        return builder.bitcast(filled, I64)
 
     return types.uint64(values, types.int64), generate
 
@@ -81,7 +71,7 @@ def lowest_bit(typing: Any, mask: Any) -> Any:
     """Index of the lowest bit that is set; the mask is not zero."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(_I1, 1))
+        return builder.cttz(arguments[0], ir.Constant(I1, 1))
 
     return types.int64(types.uint64), generate
 
@@ -92,44 +82,39 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        place = builder.bitcast(builder.gep(array.data, [arguments[1]]), ir.IntType(8).as_pointer())
+        there = builder.bitcast(builder.gep(array.data, [arguments[1]]), ir.IntType(8).as_pointer())
         function = builder.module.declare_intrinsic(
-            "llvm.prefetch", [place.type], ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
+            "llvm.prefetch", [there.type], ir.FunctionType(ir.VoidType(), [there.type, I32, I32, I32])
         )
-        read, near, data = (ir.Constant(_I32, value) for value in (0, 3, 1))
-        builder.call(function, [place, read, near, data])
+        read, near, data = (ir.Constant(I32, value) for value in (0, 3, 1))
+        builder.call(function, [there, read, near, data])
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
 
 
 @generated
-def sum_pairs(typing: Any, pairs: Any, entries: Any, changes: Any, columns: Any, sums: Any) -> Any:
-    """Sums of multiples of columns, two columns at a time, each block of filters in registers throughout.
+def sum_listed(typing: Any, n: Any, entries: Any, changes: Any, columns: Any, sums: Any) -> Any:
+    """Sums of multiples of columns, each block of filters in registers throughout.
 
-    `sums[k] = sum of changes[i] * columns[entries[i], k]` over `2 * pairs` listed columns. The number of
-    filters is a multiple of 32.
+    `sums[k] = sum of changes[i] * columns[entries[i], k]` over `n` listed columns. The number of filters is a
+    multiple of 32. Sums of 32 bits take two columns at a time: behind an odd list there is one entry more,
+    with a change of zero. Sums of 16 bits are modulo 2^16.
     """
+    widest, sum_block = (7, _sum_narrow) if sums.dtype == types.int16 else (3, _sum_pairs)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kinds = signature.args[1:]
         arrays = [
             context.make_array(kind)(context, builder, value)
-            for kind, value in zip(kinds, arguments[1:], strict=True)
+            for kind, value in zip(signature.args[1:], arguments[1:], strict=True)
         ]
         width = builder.extract_value(arrays[2].shape, 1)
-        # As few blocks as there can be, of nearly the same width: a narrow one would wait for its sums.
-        vectors = builder.udiv(width, _int64(BLOCK))
-        blocks = builder.udiv(builder.add(vectors, _int64(WIDEST - 1)), _int64(WIDEST))
-        narrow, wider = builder.udiv(vectors, blocks), builder.urem(vectors, blocks)
-        start = cgutils.alloca_once_value(builder, _int64(0))  # type: ignore[no-untyped-call]
-        with cgutils.for_range(builder, blocks) as loop:
-            more = builder.zext(builder.icmp_unsigned("<", loop.index, wider), _I64)
-            size, first = builder.add(narrow, more), builder.load(start)
-            for n in range(1, WIDEST + 1):
-                with builder.if_then(builder.icmp_unsigned("==", size, _int64(n))):
-                    _sum_block(builder, arguments[0], arrays, width, first, n)
-            builder.store(builder.add(first, builder.mul(size, _int64(BLOCK))), start)
+        in_blocks(
+            builder,
+            width,
+            widest,  # vectors whose sums fit into registers
+            lambda first, vectors: sum_block(builder, arguments[0], arrays, width, first, vectors),
+        )
         return context.get_dummy_value()
 
     return types.void(types.int64, entries, changes, columns, sums), generate
@@ -138,65 +123,109 @@ def sum_pairs(typing: Any, pairs: Any, entries: Any, changes: Any, columns: Any,
 _HALF = BLOCK // 2
 
 _LOW, _HIGH = (
-    _order(
-        [k for lane in range(0, BLOCK, 8) for i in range(lane, lane + 4) for k in (at + i, BLOCK + at + i)]
-    )
+    order([k for lane in range(0, BLOCK, 8) for i in range(lane, lane + 4) for k in (at + i, BLOCK + at + i)])
     for at in (0, 4)
 )
 """Interleave two columns, the lower and the upper four of every eight filters: one instruction each."""
 
 _FIRST, _SECOND = (
-    _order([at + 4 * four + i for four in fours for at in (0, _HALF) for i in range(4)])
+    order([at + 4 * four + i for four in fours for at in (0, _HALF) for i in range(4)])
     for fours in ((0, 1), (2, 3))
 )
 """Undo it: the first and the second half of the sums, in the order of the filters."""
 
 
-def _sum_block(builder: Any, pairs: Any, arrays: list[Any], width: Any, first: Any, vectors: int) -> None:
-    """Sum one block of `vectors` times `BLOCK` filters from the filter `first` on."""
+def _sum_narrow(builder: Any, n: Any, arrays: list[Any], width: Any, first: Any, vectors: int) -> None:
+    """Sum one block of `vectors` times `BLOCK` filters from the filter `first` on, in 16 bits."""
     entries, changes, columns, sums = arrays
-    column, half = ir.VectorType(_I16, BLOCK), ir.VectorType(_I32, _HALF)
-    before = builder.block
-    head, body, done = (builder.append_basic_block(name) for name in ("pairs", "pair", "summed"))
-    builder.branch(head)
-    builder.position_at_end(head)
-    index, *totals = (builder.phi(kind) for kind in (_I64, *[half] * (2 * vectors)))
-    for phi in (index, *totals):
-        phi.add_incoming(ir.Constant(phi.type, None if phi.type is half else 0), before)
-    builder.cbranch(builder.icmp_unsigned("<", index, pairs), body, done)
+    block = ir.VectorType(I16, BLOCK)
 
-    builder.position_at_end(body)
-    item = builder.shl(index, _int64(1))
-    factors = _load(builder, changes, item, ir.VectorType(_I16, 2))
-    factors = builder.shuffle_vector(factors, factors, _order([0, 1] * _HALF))
-    starts = [
-        builder.add(builder.mul(builder.zext(builder.load(place), _I64), width), first)
-        for place in (builder.gep(entries.data, [builder.add(item, _int64(i))]) for i in range(2))
-    ]
-    following: list[Any] = []
-    for vector in range(vectors):
-        at = _int64(vector * BLOCK)
-        both = [_load(builder, columns, builder.add(start, at), column) for start in starts]
-        for order in (_LOW, _HIGH):
-            total = totals[len(following)]
-            pair = builder.shuffle_vector(*both, order)
-            following.append(builder.add(total, _product_of_pairs(builder, pair, factors)))
-    index.add_incoming(builder.add(index, _int64(1)), body)
-    for total, value in zip(totals, following, strict=True):
-        total.add_incoming(value, body)
-    builder.branch(head)
+    def add(index: Any, totals: list[Any]) -> list[Any]:
+        change = splat(builder, builder.load(builder.gep(changes.data, [index])))
+        entry = builder.zext(builder.load(builder.gep(entries.data, [index])), I64)
+        start = builder.add(builder.mul(entry, width), first)
+        places = [builder.add(start, int64(i * BLOCK)) for i in range(vectors)]
+        products = [builder.mul(change, load(builder, columns, at, block)) for at in places]
+        return [builder.add(*pair) for pair in zip(totals, products, strict=True)]
 
-    builder.position_at_end(done)
+    totals = repeat(builder, n, [ir.Constant(block, None)] * vectors, add)
+    for i, total in enumerate(totals):
+        at = builder.add(first, int64(i * BLOCK))
+        builder.store(total, place(builder, sums, at, block)).align = 2
+
+
+def _sum_pairs(builder: Any, n: Any, arrays: list[Any], width: Any, first: Any, vectors: int) -> None:
+    """The same in 32 bits, two columns at a time."""
+    entries, changes, columns, sums = arrays
+    column, half = ir.VectorType(I16, BLOCK), ir.VectorType(I32, _HALF)
+
+    def add(index: Any, totals: list[Any]) -> list[Any]:
+        item = builder.shl(index, int64(1))
+        factors = load(builder, changes, item, ir.VectorType(I16, 2))
+        factors = builder.shuffle_vector(factors, factors, order([0, 1] * _HALF))
+        starts = [
+            builder.add(builder.mul(builder.zext(builder.load(entry), I64), width), first)
+            for entry in (builder.gep(entries.data, [builder.add(item, int64(i))]) for i in range(2))
+        ]
+        following: list[Any] = []
+        for vector in range(vectors):
+            at = int64(vector * BLOCK)
+            both = [load(builder, columns, builder.add(start, at), column) for start in starts]
+            for mixed in (_LOW, _HIGH):
+                total, pair = totals[len(following)], builder.shuffle_vector(*both, mixed)
+                following.append(builder.add(total, product_of_pairs(builder, pair, factors)))
+        return following
+
+    totals = repeat(
+        builder,
+        builder.lshr(builder.add(n, int64(1)), int64(1)),
+        [ir.Constant(half, None)] * (2 * vectors),
+        add,
+    )
     for vector in range(vectors):
         low, high = totals[2 * vector : 2 * vector + 2]
-        for i, order in enumerate((_FIRST, _SECOND)):
-            at = builder.add(first, _int64(vector * BLOCK + i * _HALF))
-            builder.store(builder.shuffle_vector(low, high, order), _place(builder, sums, at, half)).align = 4
+        for i, straight in enumerate((_FIRST, _SECOND)):
+            at = builder.add(first, int64(vector * BLOCK + i * _HALF))
+            builder.store(
+                builder.shuffle_vector(low, high, straight), place(builder, sums, at, half)
+            ).align = 4
 
 
-def _product_of_pairs(builder: Any, numbers: Any, factors: Any) -> Any:
-    """`numbers[2 k] * factors[2 k] + numbers[2 k + 1] * factors[2 k + 1]`, written so that LLVM knows it."""
-    wide = ir.VectorType(_I32, BLOCK)
-    products = builder.mul(builder.sext(numbers, wide), builder.sext(factors, wide))
-    even, odd = (builder.shuffle_vector(products, products, _order(list(range(i, BLOCK, 2)))) for i in (0, 1))
-    return builder.add(even, odd)
+_FLOATS = 16
+"""Floats in one vector of `sum_products`; two of them are summed side by side."""
+
+
+@generated
+def sum_products(typing: Any, one: Any, start: Any, other: Any, begin: Any, n: Any) -> Any:
+    """Sum of `one[start + i] * other[begin + i]` over `n` float32 numbers, a multiple of 32; in this order.
+
+    Lane `j` of 32 sums products `j`, `j + 32`, and so on, each product and each sum rounded. Then the upper
+    half of the lanes is added to the lower one, until one is left.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds, lanes = signature.args, ir.VectorType(ir.FloatType(), _FLOATS)
+        arrays = [context.make_array(kinds[i])(context, builder, arguments[i]) for i in (0, 2)]
+
+        def add(index: Any, totals: list[Any]) -> list[Any]:
+            at = builder.mul(index, int64(2 * _FLOATS))
+            following = []
+            for half, total in enumerate(totals):
+                offset = builder.add(at, int64(half * _FLOATS))
+                factors = [
+                    load(builder, array, builder.add(arguments[first], offset), lanes, align=4)
+                    for array, first in zip(arrays, (1, 3), strict=True)
+                ]
+                following.append(builder.fadd(total, builder.fmul(*factors)))
+            return following
+
+        turns = builder.sdiv(arguments[4], int64(2 * _FLOATS))
+        left = builder.fadd(*repeat(builder, turns, [ir.Constant(lanes, None)] * 2, add))
+        width = _FLOATS
+        while width > 1:
+            width //= 2
+            halves = [order(list(range(at, at + width))) for at in (0, width)]
+            left = builder.fadd(*(builder.shuffle_vector(left, left, half) for half in halves))
+        return builder.extract_element(left, ir.Constant(I32, 0))
+
+    return types.float32(one, types.int64, other, types.int64, types.int64), generate

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from streamfeat.kernels.compiled import inlined, kernel
 from streamfeat.kernels.layout import MOMENT_LINEAR, MOMENT_QUADRATIC, MOMENT_SQUARES, MOMENT_SUM, Operator
-from streamfeat.kernels.vectors import EIGHT, MASK_BITS, copy_eight, filled_mask, lowest_bit, sum_pairs
+from streamfeat.kernels.vectors import EIGHT, MASK_BITS, copy_eight, filled_mask, lowest_bit, sum_listed
 
 
 @inlined
@@ -30,20 +30,20 @@ def sum_columns(
     entries: NDArray[np.int32],
     changes: NDArray[np.int16],
     columns: NDArray[np.int16],
-    sums: NDArray[np.int32],
+    sums: NDArray[np.int32] | NDArray[np.int16],
 ) -> None:
-    """Sum a multiple of each listed column, two at a time.
+    """Sum a multiple of each listed column, in as many bits as the sums have.
 
     Args:
         n: length of the list.
         entries: `(> n,)` rows of `columns`; one more is written behind an odd number.
         changes: `(> n,)` what each is multiplied with; the same.
         columns: `(d, Kp)`, more than -2^15.
-        sums: `(Kp,)`, overwritten.
+        sums: `(Kp,)` int32 or int16, overwritten.
     """
     if n % 2:
         entries[n], changes[n] = entries[n - 1], 0
-    sum_pairs((n + 1) // 2, entries, changes, columns, sums)
+    sum_listed(n, entries, changes, columns, sums)
 
 
 @inlined
@@ -109,9 +109,9 @@ def change_entries(
     changes: NDArray[np.int16],
     values: NDArray[np.int16],
     operator: Operator,
-    projection: NDArray[np.int32],
+    projection: NDArray[np.int32] | NDArray[np.int16],
     moments: NDArray[np.int64],
-    sums: NDArray[np.int32],
+    sums: NDArray[np.int32] | NDArray[np.int16],
 ) -> None:
     """Let listed entries of a volume change, and all that is kept of the volume with them.
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.recordings.reader import Label, Packet
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session, StreamItem
@@ -138,16 +139,16 @@ class _WatchedSession(Session):
         self.brought_by_us: list[int] = []
         self._latest_us = 0
 
-    def process(self, item: StreamItem) -> Iterator[Emission]:
+    def batches(self, item: StreamItem, /) -> Iterator[EmissionBatch]:
         if isinstance(item, Label):
             self._latest_us = max(self._latest_us, item.start_us)
         elif isinstance(item, Packet) and len(item.events):
             self._latest_us = max(self._latest_us, int(item.events["t"].max()))
-        for emission in super().process(item):
-            self.brought_by_us.append(self._latest_us)
-            yield emission
+        for batch in super().batches(item):
+            self.brought_by_us += [self._latest_us] * len(batch)
+            yield batch
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """Emit nothing: the measurement ends the stream, not the recording."""
         return iter(())
 

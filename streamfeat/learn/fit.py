@@ -92,6 +92,7 @@ class Material:
             whitening=self.whitener.whitening_,
             mean=self.whitener.mean_,
             eps=self.whitener.eps,
+            narrow=True,
             provenance=provenance,
         )
 

@@ -33,6 +33,7 @@ from streamfeat.live.health import Health
 from streamfeat.live.intake import Intake
 from streamfeat.live.shard import Shard
 from streamfeat.live.topic import MAX_TOPICS, Barrier, resolution_in
+from streamfeat.stream.batch import EmissionBatch, Emitter
 from streamfeat.stream.cameras import MAX_CAMERAS, CameraLeft, Cameras
 from streamfeat.stream.emission import Emission
 from streamfeat.stream.session import StreamItem
@@ -62,7 +63,7 @@ class _Kept:
     made: int
 
 
-class Checkpointer:
+class Checkpointer(Emitter):
     """Keeps a state file up to date; both the processor of a pipeline, around `Health`, and its last sink.
 
     Args:
@@ -96,23 +97,23 @@ class Checkpointer:
         self._thread = threading.Thread(target=self._keep, name="streamfeat state", daemon=True)
         self._thread.start()
 
-    def process(self, item: StreamItem | CameraLeft | Barrier) -> Iterator[Emission]:
+    def batches(self, item: StreamItem | CameraLeft | Barrier, /) -> Iterator[EmissionBatch]:
         """Process an item, or take a checkpoint at a barrier."""
         if isinstance(item, Barrier):
             self._take(item.topics)
             return
-        for emission in self._health.process(item):
-            self._made += 1
-            yield emission
+        for batch in self._health.batches(item):
+            self._made += len(batch)
+            yield batch
 
     def rest(self) -> None:
         """Let the cameras work ahead."""
         self._health.rest()
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """Take a checkpoint before the cameras' streams are ended, where the next run goes on."""
         self._take(self._intake.snapshot())
-        yield from self._health.finish()
+        yield from self._health.last_batches()
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """All other sinks have written these."""
@@ -163,7 +164,7 @@ def _write_state(path: Path, fingerprint: str, kept: _Kept) -> None:
         "topics": [{"topic": topic, **values} for topic, values in kept.topics.items()],
         "cameras": [{"topic": topic, **_to_json(session)} for topic, session in kept.cameras.items()],
     }
-    write_safetensors(path, _KIND, _VERSION, arrays, header)
+    write_safetensors(path, _KIND, _VERSION, arrays, header, private=True)
 
 
 def _scales(name: str, engine: Snapshot) -> Iterator[tuple[str, Snapshot]]:

@@ -20,6 +20,7 @@ from streamfeat.live.inbox import Inbox
 from streamfeat.live.intake import Intake
 from streamfeat.live.warnings import Warnings
 from streamfeat.messages.delivery import DeliveryStats
+from streamfeat.stream.batch import EmissionBatch, Emitter
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import Emission
 from streamfeat.stream.pipeline import PipelineStats
@@ -54,7 +55,7 @@ class CameraFigures:
     latest: Emission | None
 
 
-class Health:
+class Health(Emitter):
     """Counts of one live job; a processor too, which times the cameras it wraps.
 
     Args:
@@ -90,22 +91,23 @@ class Health:
             buckets=_BUCKETS,
         )
         self._recent_updates, self._recent_end_to_end = RecentLatencies(), RecentLatencies()
-        self._latest: dict[str, Emission] = {}
+        self._latest: dict[str, EmissionBatch] = {}
         self.registry.register(self)
 
-    def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
+    def batches(self, item: StreamItem | CameraLeft, /) -> Iterator[EmissionBatch]:
         """Process an item with the cameras; the time that sinks take in between is not counted."""
         spent = 0.0
-        emissions = self._cameras.process(item)
+        made = self._cameras.batches(item)
         while True:
             started = time.perf_counter()
-            emission = next(emissions, None)
+            batch = next(made, None)
             spent += time.perf_counter() - started
-            if emission is None:
+            if batch is None:
                 break
-            self._latest[emission.topic] = emission
-            yield emission
-        self._update.observe(spent)
+            self._latest[batch.topic] = batch
+            yield batch
+        if self._server:  # or nobody reads it, and it is dearer than all other figures of a packet
+            self._update.observe(spent)
         self._recent_updates.add(1e9 * spent)
         if isinstance(item, CameraLeft):
             self._latest.pop(item.topic, None)
@@ -114,15 +116,16 @@ class Health:
         """Let the cameras work ahead."""
         self._cameras.rest()
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """End the cameras' streams."""
-        yield from self._cameras.finish()
+        yield from self._cameras.last_batches()
 
     def on_published(self, source_ns: int, now_ns: int) -> None:
         """Count how long it took from a packet's publication to that of its features."""
         if source_ns:
             seconds = (now_ns - source_ns) / 1e9
-            self._end_to_end.observe(seconds)
+            if self._server:
+                self._end_to_end.observe(seconds)
             self._recent_end_to_end.add(now_ns - source_ns)
 
     def serve(self, host: str, port: int) -> int:
@@ -197,7 +200,7 @@ class Health:
     def cameras(self) -> list[CameraFigures]:
         """Each camera that is served, in order of appearance."""
         return [
-            CameraFigures(topic, stats.events, self._latest.get(topic))
+            CameraFigures(topic, stats.events, latest[-1] if (latest := self._latest.get(topic)) else None)
             for topic, stats in self._cameras.stats_by_topic().items()
         ]
 

@@ -20,6 +20,7 @@ from streamfeat.denoise.stage import Denoising
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.threads import usable_threads
 from streamfeat.errors import InputError
+from streamfeat.files.outputs import locked_file
 from streamfeat.live.checkpoint import Checkpointer, read_state
 from streamfeat.live.health import Health, parse_address
 from streamfeat.live.inbox import Inbox
@@ -131,7 +132,7 @@ class ListenJob:
         self._learn_online, self._network, self._publish = learn_online, network, publish
         self._engine_of, self._tap, self._threads = engine_of, tap, usable_threads(threads)
         self._patience_ns = patience_s * 1e9
-        self.interrupted = False
+        self.interrupted, self._keep_features = False, True
         self._warnings = Warnings.on(console)
         self._inbox = Inbox(max_delay_s=max_delay_s)
         window_us = self._encoder.geometry.window_us
@@ -154,8 +155,10 @@ class ListenJob:
         Raises:
             InputError: an output, the network or the metrics address cannot be used.
         """
-        warm_up(self._encoder, self._policy, decoders=True)
         with ExitStack() as opened:
+            if self._state:
+                _hold(self._state, opened)
+            warm_up(self._encoder, self._policy, self._classifier, decoders=True)
             session = opened.enter_context(self._network.open())
             if self._address:
                 opened.callback(self.health.stop_serving)
@@ -197,6 +200,7 @@ class ListenJob:
         """
         console = outputs.console
         labels = self._classifier.labels if self._classifier else ()
+        self._keep_features = self._publish or outputs.reads_features(has_classifier=bool(labels))
         with ExitStack() as held:
 
             def sinks() -> Sequence[Sink[Emission]]:
@@ -241,6 +245,7 @@ class ListenJob:
             engine=self._engine_of(topic),
             denoising=self._denoising,
             load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
+            keep_features=self._keep_features,
             threads=self._threads,
         )
 
@@ -273,8 +278,20 @@ def _screen(health: Health, console: Console) -> Live:
     )
 
 
+def _hold(state: Path, opened: ExitStack) -> None:
+    """Keep a state for this job alone, as long as `opened` is; so it is seen, too, that it can be written.
+
+    Raises:
+        InputError: another listener has it, or its folder cannot be written to.
+    """
+    path = state.with_name(f"{state.name}.lock")
+    lock = locked_file(path, state, private=True)
+    opened.callback(lock.close)
+    opened.callback(path.unlink, missing_ok=True)
+
+
 def _recording_sink(path: Path) -> RecordingSink:
-    writer = RecordingWriter(path, overwrite=True, keep_partial=True, compression="lz4")
+    writer = RecordingWriter(path, overwrite=True, keep_partial=True, private=True, compression="lz4")
     return RecordingSink(writer, lambda topic, kind: "/" + beside(topic, kind).lstrip("/"))
 
 

@@ -131,18 +131,19 @@ class _Cutter:
         self._epoch = 0
         self.events = 0
 
-    def process(self, item: Packet | Label) -> Iterator[EventPacket | LabelMessage]:
+    def batches(self, item: Packet | Label) -> Iterator[list[EventPacket | LabelMessage]]:
         if isinstance(item, Packet):
             if item.epoch != self._epoch:
                 self._epoch = item.epoch
                 self._writer.restart()
-            yield from self._writer.messages(item.events, item.resolution)
+            for message in self._writer.messages(item.events, item.resolution):
+                yield [message]
             self.events += len(item.events)
         else:
             stamp_ns, duration_ns = item.start_us * 1000, item.duration_us * 1000
-            yield LabelMessage(stamp_ns, "", duration_ns, item.label, item.split, item.source)
+            yield [LabelMessage(stamp_ns, "", duration_ns, item.label, item.split, item.source)]
 
-    def finish(self) -> Iterator[EventPacket | LabelMessage]:
+    def last_batches(self) -> Iterator[list[EventPacket | LabelMessage]]:
         yield from ()
 
     def rest(self) -> None:

@@ -105,6 +105,7 @@ class RecordJob:
                         compression=self._compression,
                         overwrite=self._overwrite,
                         keep_partial=True,
+                        private=True,
                     )
                 )
             )
@@ -187,10 +188,10 @@ class RecordJob:
 class _Unchanged:
     """The processor that does nothing."""
 
-    def process(self, item: RawMessage | _Flush) -> Iterator[RawMessage | _Flush]:
-        yield item
+    def batches(self, item: RawMessage | _Flush) -> Iterator[list[RawMessage | _Flush]]:
+        yield [item]
 
-    def finish(self) -> Iterator[RawMessage | _Flush]:
+    def last_batches(self) -> Iterator[list[RawMessage | _Flush]]:
         yield from ()
 
     def rest(self) -> None:

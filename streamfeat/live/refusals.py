@@ -14,8 +14,6 @@ __all__ = ["MAX_NAME", "MAX_PAYLOAD_BYTES", "RefusalError", "checked_label", "pa
 MAX_PAYLOAD_BYTES = 4 << 20
 MAX_NAME = 1024
 """Characters of the name of a topic."""
-_LONGEST_TEXT = 4096
-"""Characters of each text of a label."""
 
 
 class RefusalError(Exception):
@@ -81,7 +79,4 @@ def checked_label(message: RawMessage) -> Label:
         raise RefusalError("bad label", str(error)) from None
     if label.duration_us > MAX_LABEL_US:
         raise RefusalError("bad label", f"{label.label[:40]!r} lasts {label.duration_us} us")
-    longest = max(len(text) for text in (label.label, label.split, label.source))
-    if longest > _LONGEST_TEXT:
-        raise RefusalError("bad label", f"a text of {longest} characters, at most {_LONGEST_TEXT}")
     return label

@@ -1,8 +1,8 @@
 """Packet payloads to events and back, for the four encodings of event_camera_msgs.
 
 Lives here: `mono`, `libcaer`, `libcaer_cmp` and `evt3`, bytes in and arrays out.
-Not here: messages around the payload, files, and the resolution: events outside it are decoded like any
-other, and counted where they are fed.
+Not here: how events become 16-bit words (`words`); messages around the payload, files, and the resolution:
+events outside it are decoded like any other, and counted where they are fed.
 
 Payloads are hostile until proven otherwise. What a payload can make us allocate is bounded by 96 times its
 length (a 16-bit word holds at most 12 events of 16 bytes), twice that where the room is kept for packets to
@@ -16,8 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.events import EVENT_DTYPE, Events, make_events
-from streamfeat.kernels.decode import decode_evt3, decode_libcaer_cmp, decode_mono
+from streamfeat.events import EVENT_DTYPE, Events, Resolution
+from streamfeat.kernels.decode import (
+    LIBCAER_WRAP_US,
+    decode_evt3,
+    decode_libcaer,
+    decode_libcaer_cmp,
+    decode_mono,
+    time_span,
+)
+from streamfeat.messages.words import EVT3_WRAP_US, Words, check_sorted, encode_evt3, libcaer_cmp_words
 
 __all__ = [
     "EVT3_WRAP_US",
@@ -35,24 +43,33 @@ MAX_PACKET_EVENTS = 1 << 24
 _KEPT_EVENTS = 1 << 19
 """A decoder of words keeps room for so many events, 8 MB, of which memory is taken for those that came."""
 
-_Words = NDArray[np.uint16]
+EVERY_PIXEL: Resolution = (1 << 16, 1 << 16)
+"""A sensor that no coordinate lies outside of."""
+
 
 _LIBCAER = np.dtype([("data", "<u4"), ("us", "<u4")])
-_LIBCAER_WRAP_US = 1 << 31
-EVT3_WRAP_US = 1 << 24
-_EVT3_MAX_STEP = 1 << 11  # of TIME_HIGH: half of its 12 bits, so that no reader takes it for a step back
-_EVT3_MAX_BRIDGE = 1 << 12  # TIME_HIGH words that may cross a silent gap: 9.5 hours
 
 
 class Decoder(Protocol):
-    """The decoder of one topic; it may carry state from packet to packet."""
+    """The decoder of one topic; it may carry state from packet to packet.
 
-    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+    Attributes:
+        n_inside: how many events of the latest payload are on the sensor.
+        span: `(2,)` int64, their earliest and latest time; as it was where there are none.
+    """
+
+    n_inside: int
+    span: NDArray[np.int64]
+
+    def decode(
+        self, payload: bytes | memoryview, time_base_ns: int, resolution: Resolution = EVERY_PIXEL
+    ) -> Events:
         """Decode one payload.
 
         Args:
             payload: the bytes of the packet, not changed.
             time_base_ns: `time_base` of the packet, nanoseconds.
+            resolution: of the sensor, for the span of times; events outside of it are decoded, too.
 
         Returns:
             `(n,)` array of `EVENT_DTYPE`, stream time in microseconds, in stored order.
@@ -90,6 +107,7 @@ class _Stateful:
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
         """Start with nothing seen."""
         self._max_events = max_events
+        self.n_inside, self.span = 0, np.zeros(2, np.int64)
         self._state = np.zeros(self._n_state, np.int64)
 
     def resync(self) -> None:
@@ -117,7 +135,7 @@ class _OfWords(_Stateful):
     _vectors: dict[int, int]  # types that are one event for each set bit, and how many bits count
     _kept: Events = np.zeros(0, EVENT_DTYPE)
 
-    def _room_for(self, words: _Words) -> Events:
+    def _room_for(self, words: Words) -> Events:
         """Room for all events that these words can hold, at least.
 
         Raises:
@@ -132,39 +150,58 @@ class _OfWords(_Stateful):
             self._kept = np.zeros(1 << (most - 1).bit_length(), EVENT_DTYPE)
         return self._kept
 
-    def _events(self, room: Events, n: int) -> Events:
-        """The first n events of a room, in memory that nothing else uses."""
+    def _events(self, room: Events, n: int, resolution: Resolution) -> Events:
+        """The first n events of a room, measured, in memory that nothing else uses."""
+        events = room[:n]
+        self.n_inside = time_span(events, *resolution, self.span)
         if room is not self._kept:
-            return room[:n]
+            return events
         # As numbers: of records NumPy copies field by field, in ten times the time.
-        return room.view(np.int64)[: 2 * n].copy().view(EVENT_DTYPE)
+        return events.view(np.int64).copy().view(EVENT_DTYPE)
 
 
-class MonoDecoder(_Stateful):
+class _OfRecords(_Stateful):
+    """What the decoders of 64-bit records share: the length of a payload is the number of its events."""
+
+    _encoding: str
+
+    def _read(self, payload: bytes | memoryview) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+        """The records of a payload, and room for their events.
+
+        A copy, so that a kernel meets one array type, whatever address the bytes had.
+        """
+        words = _records(payload, np.dtype(np.uint64), self._encoding, self._max_events).copy()
+        return words, np.empty(2 * len(words), np.int64)
+
+
+class MonoDecoder(_OfRecords):
     """`mono`: u64 words of `dt` ns (32 bits), x (16), y (15) and polarity (1)."""
 
-    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+    _encoding = "mono"
+
+    def decode(
+        self, payload: bytes | memoryview, time_base_ns: int, resolution: Resolution = EVERY_PIXEL
+    ) -> Events:
         """See `Decoder.decode`."""
-        # A copy, so that a kernel meets one array type, whatever address the bytes had.
-        words = _records(payload, np.dtype(np.uint64), "mono", self._max_events).copy()
-        events = np.zeros(len(words), EVENT_DTYPE)
+        words, room = self._read(payload)
         # time_base may use all 64 bits, so the sum is taken apart instead of overflowing
-        decode_mono(words, *divmod(time_base_ns, 1000), events)
-        return events
+        base_us, rest_ns = divmod(time_base_ns, 1000)
+        self.n_inside = decode_mono(words, base_us, rest_ns, *resolution, room, self.span)
+        return room.view(EVENT_DTYPE)
 
 
-class LibcaerDecoder(_Stateful):
+class LibcaerDecoder(_OfRecords):
     """`libcaer`: u32 address and polarity, then u32 microseconds that wrap at 31 bits within a packet."""
 
-    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+    _encoding = "libcaer"
+
+    def decode(
+        self, payload: bytes | memoryview, time_base_ns: int, resolution: Resolution = EVERY_PIXEL
+    ) -> Events:
         """See `Decoder.decode`."""
-        records = _records(payload, _LIBCAER, "libcaer", self._max_events)
-        data = records["data"]
-        us = (records["us"] & (_LIBCAER_WRAP_US - 1)).astype(np.int64)
-        # Only a fall of more than half the range is a wrap: a smaller one is an event out of order.
-        wraps = np.cumsum(np.diff(us, prepend=us[:1]) < -_LIBCAER_WRAP_US // 2)
-        t = time_base_ns // 1000 + us + wraps * _LIBCAER_WRAP_US
-        return make_events(data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1, t)
+        words, room = self._read(payload)
+        self.n_inside = decode_libcaer(words, time_base_ns // 1000, *resolution, room, self.span)
+        return room.view(EVENT_DTYPE)
 
 
 class LibcaerCmpDecoder(_OfWords):
@@ -172,7 +209,9 @@ class LibcaerCmpDecoder(_OfWords):
 
     _n_state, _encoding, _single, _vectors = 3, "libcaer_cmp", 3, {5: 8}
 
-    def decode(self, payload: bytes | memoryview, time_base_ns: int) -> Events:
+    def decode(
+        self, payload: bytes | memoryview, time_base_ns: int, resolution: Resolution = EVERY_PIXEL
+    ) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "libcaer_cmp")
         room = self._room_for(words)
@@ -180,7 +219,7 @@ class LibcaerCmpDecoder(_OfWords):
         if n < 0:
             at = -1 - n
             raise InputError(f"libcaer_cmp payload: unknown word 0x{words[at]:04x} at byte {2 * at}")
-        return self._events(room, n)
+        return self._events(room, n, resolution)
 
 
 class Evt3Decoder(_OfWords):
@@ -192,11 +231,13 @@ class Evt3Decoder(_OfWords):
 
     _n_state, _encoding, _single, _vectors = 6, "evt3", 0x2, {0x4: 12, 0x5: 8}
 
-    def decode(self, payload: bytes | memoryview, time_base_ns: int = 0) -> Events:
+    def decode(
+        self, payload: bytes | memoryview, time_base_ns: int = 0, resolution: Resolution = EVERY_PIXEL
+    ) -> Events:
         """See `Decoder.decode`."""
         words = _words(payload, "evt3")
         room = self._room_for(words)
-        return self._events(room, decode_evt3(words, self._state, room))
+        return self._events(room, decode_evt3(words, self._state, room), resolution)
 
     def resync(self) -> None:
         """See `Decoder.resync`: wait for time and address again; the wraps counted so far stay."""
@@ -252,7 +293,7 @@ def encode(events: Events, encoding: str, after_us: int = 0) -> tuple[bytes, int
         return b"", 0
     _check_fields(events, encoding)
     if encoding == "evt3":
-        return _encode_evt3(events, after_us), 0
+        return encode_evt3(events, after_us), 0
     first_us = int(events["t"].min())
     offset_us = events["t"] - first_us
     if encoding == "mono":
@@ -260,15 +301,15 @@ def encode(events: Events, encoding: str, after_us: int = 0) -> tuple[bytes, int
         x, y, p, dt_ns = (c.astype("<u8") for c in (events["x"], events["y"], events["p"], offset_us * 1000))
         payload = dt_ns | x << 32 | y << 48 | p << 63
     elif encoding == "libcaer":
-        _check_sorted(events, "libcaer")
-        _check_span(offset_us, _LIBCAER_WRAP_US - 1, "libcaer")
+        check_sorted(events, "libcaer")
+        _check_span(offset_us, LIBCAER_WRAP_US - 1, "libcaer")
         x, y, p = (events[name].astype("<u4") for name in ("x", "y", "p"))
         payload = np.empty(len(events), _LIBCAER)
         payload["data"] = x << 17 | y << 2 | p << 1 | 1  # bit 0: libcaer's mark of a valid event
         payload["us"] = offset_us
     else:
         _check_span(offset_us, (1 << 24) - 1, "libcaer_cmp")
-        payload = _libcaer_cmp_words(events, offset_us)
+        payload = libcaer_cmp_words(events, offset_us)
     return payload.tobytes(), first_us * 1000
 
 
@@ -289,12 +330,12 @@ def _records(
     return records
 
 
-def _words(payload: bytes | memoryview, encoding: str) -> _Words:
+def _words(payload: bytes | memoryview, encoding: str) -> Words:
     """Copy a payload out, so that a kernel meets one array type, whatever address the bytes had."""
     return _records(payload, np.dtype(np.uint16), encoding, MAX_PACKET_EVENTS).copy()
 
 
-def _count_events(words: _Words, single: int, vectors: dict[int, int]) -> int:
+def _count_events(words: Words, single: int, vectors: dict[int, int]) -> int:
     """How many events words of these types can hold, see `_OfWords`."""
     kind = words >> 12
     n = int(np.count_nonzero(kind == single))
@@ -325,75 +366,9 @@ def _check_fields(events: Events, encoding: str) -> None:
         raise InputError(f"{encoding} has no negative time, but an event has t = {events['t'].min()} us")
 
 
-def _check_sorted(events: Events, encoding: str) -> None:
-    falls = np.flatnonzero(np.diff(events["t"]) < 0)
-    if len(falls):
-        raise InputError(
-            f"{encoding} needs events in order of time, but event {falls[0] + 1} is earlier than the one "
-            "before it; sort them, or write mono"
-        )
-
-
 def _check_span(offset_us: NDArray[np.int64], limit_us: int, encoding: str) -> None:
     if offset_us.max() > limit_us:
         raise InputError(
             f"a {encoding} packet spans at most {limit_us} us, these events {offset_us.max()} us; "
             "write them as several packets"
         )
-
-
-def _changed(column: NDArray[np.int64], before: int) -> NDArray[np.bool_]:
-    """Mark the entries that differ from the one before."""
-    changed: NDArray[np.bool_] = np.diff(column, prepend=before) != 0
-    return changed
-
-
-def _libcaer_cmp_words(events: Events, offset_us: NDArray[np.int64]) -> _Words:
-    """Words TIME_HIGH, TIME_LOW and X where they change, and Y for every event."""
-    high, low, x = offset_us >> 12, offset_us & 0xFFF, events["x"].astype(np.int64)
-    y = events["y"] | events["p"].astype(np.uint16) << 11
-    words = np.stack([high, 0x1000 | low, 0x2000 | x, 0x3000 | y], axis=1).astype("<u2")
-    keep = np.stack([_changed(high, 0), _changed(low, 0), _changed(x, -1), np.ones(len(x), bool)], axis=1)
-    kept: _Words = words[keep]
-    return kept
-
-
-def _encode_evt3(events: Events, after_us: int) -> bytes:
-    """Words TIME_HIGH, TIME_LOW and ADDR_Y where they change, and ADDR_X for every event.
-
-    TIME_LOW follows each TIME_HIGH, as from a sensor: faery and eventcv take it for 0 until it comes.
-    """
-    _check_sorted(events, "evt3")
-    t, y = events["t"], events["y"].astype(np.int64)
-    if t[0] < after_us:
-        raise InputError(f"evt3 needs events in order of time, but {t[0]} us follows {after_us} us")
-    high, low = t >> 12, t & 0xFFF
-    x = events["x"] | events["p"].astype(np.uint16) << 11
-    words = np.stack([0x8000 | high & 0xFFF, 0x6000 | low, y, 0x2000 | x], axis=1).astype("<u2")
-    is_high, is_low = _changed(high, -1), _changed(low, -1)
-    keep = np.stack([is_high, is_low | is_high, _changed(y, -1), np.ones(len(y), bool)], axis=1)
-    # A packet can be read on its own when it starts with both times; bridges stand in front of their event.
-    before = np.concatenate([[after_us >> 12], high[:-1]])
-    pieces, done = [], 0
-    for gap in np.flatnonzero((high - before > _EVT3_MAX_STEP) | (high >> 12 != before >> 12)):
-        pieces += [words[done:gap][keep[done:gap]], _evt3_bridge(int(before[gap]), int(high[gap]))]
-        done = int(gap)
-    pieces.append(words[done:][keep[done:]])
-    return np.concatenate(pieces).tobytes()
-
-
-def _evt3_bridge(start: int, stop: int) -> _Words:
-    """TIME_HIGH words from `start` towards `stop` in steps that count every wrap.
-
-    Each wrap is a step from 0xFFF to 0: faery 0.7.1 takes no other for one, and OpenEB none that is far off.
-    """
-    if stop - start > _EVT3_MAX_STEP * _EVT3_MAX_BRIDGE:
-        raise InputError(
-            f"evt3 has 24-bit time and cannot jump from {start << 12} to {stop << 12} us; "
-            "subtract an offset from all times, or write mono"
-        )
-    steps = np.arange((start // _EVT3_MAX_STEP + 1) * _EVT3_MAX_STEP, stop + 1, _EVT3_MAX_STEP)
-    wraps = steps[steps % (EVT3_WRAP_US >> 12) == 0]
-    bridge = np.unique(np.concatenate([[start], wraps - 1, steps[steps < stop]]))
-    words: _Words = (0x8000 | bridge & 0xFFF).astype("<u2")
-    return words

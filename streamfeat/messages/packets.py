@@ -13,6 +13,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.events import Events, Resolution
 from streamfeat.files.json_fields import Fields
+from streamfeat.kernels.decode import time_span
 from streamfeat.messages.cdr import EventArray, EventPacket, LabelMessage
 from streamfeat.messages.codecs import (
     EVT3_WRAP_US,
@@ -27,10 +28,12 @@ from streamfeat.messages.event_messages import EVENT_SCHEMAS
 
 __all__ = [
     "EVENT_SCHEMAS",
+    "MAX_LABEL_TEXT",
     "MAX_LABEL_US",
     "MAX_PIXELS",
     "MAX_STREAM_US",
     "Content",
+    "Item",
     "Label",
     "Packet",
     "PacketReader",
@@ -46,6 +49,8 @@ _LARGEST = 1 << 62  # of a number in a snapshot
 MAX_PIXELS = 1 << 22
 """Of a sensor whose packets are used: the largest have 2^20, and an engine takes memory for each pixel."""
 MAX_LABEL_US = 3_600_000_000
+MAX_LABEL_TEXT = 4096
+"""Characters of each text of a label, which each emission of its sample says again."""
 """The longest labelled sample of a live topic."""
 MAX_STREAM_US = (1 << 31) * 1_000_000 - 2 * MAX_LABEL_US
 """The latest time of a message: times go into message stamps, which have 31 bits of seconds."""
@@ -105,7 +110,8 @@ class Label:
         """Read a `streamfeat_msgs/msg/Label`.
 
         Raises:
-            InputError: the bytes are no such message, or its times cannot be those of a message.
+            InputError: the bytes are no such message, its times cannot be those of a message, or a text has
+                more than `MAX_LABEL_TEXT` characters.
         """
         m = LabelMessage.from_cdr(data)
         start_us, duration_us = m.stamp_ns // 1000, m.duration_ns // 1000
@@ -114,7 +120,14 @@ class Label:
                 f"label {m.label[:40]!r} from {start_us} us on, {duration_us} us long: times lie between "
                 f"0 and {MAX_STREAM_US} us"
             )
+        longest = max(len(text) for text in (m.label, m.split, m.source))
+        if longest > MAX_LABEL_TEXT:
+            raise InputError(f"a label with a text of {longest} characters; at most {MAX_LABEL_TEXT}")
         return cls(start_us, duration_us, m.label, m.split, m.source, topic)
+
+
+Item = Packet | Label
+"""What comes out of a timeline."""
 
 
 class PacketReader:
@@ -127,6 +140,8 @@ class PacketReader:
         encoding: of the latest message.
         resolution: `(height, width)` of the latest message that could be decoded; None before it.
         time_us: the time that the latest message gave for itself; None where it has none.
+        n_inside: how many events of the latest message are on the sensor.
+        span: `(2,)` int64, their earliest and latest time; as it was where there are none.
     """
 
     def __init__(self, max_events: int = MAX_PACKET_EVENTS) -> None:
@@ -134,6 +149,8 @@ class PacketReader:
         self.encoding = ""
         self.resolution: Resolution | None = None
         self.time_us: int | None = None
+        self.n_inside = 0
+        self.span = np.zeros(2, np.int64)
         self._max_events = max_events
         self._decoders: dict[str, Decoder] = {}
         self._last_seq: int | None = None
@@ -156,6 +173,7 @@ class PacketReader:
         if isinstance(content, EventArray):
             self.resolution = _resolution(content.height, content.width)
             self.encoding, self.time_us = schema.partition("/")[0], None
+            self.n_inside = time_span(content.events, *self.resolution, self.span)
             return content.events
         if self._last_seq is not None and content.seq > self._last_seq + 1:
             self.resync()
@@ -166,7 +184,8 @@ class PacketReader:
         decoder = self._decoders.get(content.encoding)
         if decoder is None:
             decoder = self._decoders[content.encoding] = make_decoder(content.encoding, self._max_events)
-        events = decoder.decode(content.events, content.time_base)
+        events = decoder.decode(content.events, content.time_base, resolution)
+        self.n_inside, self.span = decoder.n_inside, decoder.span
         if isinstance(decoder, Evt3Decoder) and len(events):
             self._place(decoder, events, content.stamp_ns)
         self.encoding, self.resolution = content.encoding, resolution
@@ -215,6 +234,7 @@ class PacketReader:
             if 0 < wraps <= _MOST_WRAPS:
                 decoder.count_wraps(wraps)
                 events["t"] += wraps * EVT3_WRAP_US
+                decoder.span += wraps * EVT3_WRAP_US
         self._is_broken = False
         self._before = stamp_ns, int(events["t"][-1])
 

@@ -23,7 +23,7 @@ from streamfeat.messages.clock import CameraClock
 from streamfeat.messages.codecs import MAX_PACKET_EVENTS
 from streamfeat.messages.delivery import Delivery, Verdict, fingerprint_of
 from streamfeat.messages.event_messages import parse_events
-from streamfeat.messages.packets import MAX_STREAM_US, Content, Label, Packet, PacketReader
+from streamfeat.messages.packets import MAX_STREAM_US, Content, Item, Label, Packet, PacketReader
 from streamfeat.messages.strays import BACK_US, STEP_US
 
 __all__ = ["HOLD_NS", "TIMELINE_COUNTS", "Timeline"]
@@ -118,10 +118,10 @@ class Timeline:
         Args:
             now_ns: by the clock that gives arrival times.
         """
-        happened = [self._happened[name] for name in _CLOCK_COUNTS]
+        happened = {"happened": [self._happened[name] for name in _CLOCK_COUNTS], "anew": self._counts_anew}
         return {
             "reader": self._reader.snapshot(),
-            "clock": self._clock.snapshot(now_ns) | {"happened": happened, "anew": self._counts_anew},
+            "clock": self._clock.snapshot(now_ns) | happened,
             "delivery": self.delivery.snapshot(now_ns),
             "stream_us": self.reached_us,
             "lost": self._lost + self.is_holding,
@@ -234,19 +234,20 @@ class Timeline:
         except InputError:
             self.miss()
             raise
-        resolution, until_us = reader.resolution, reader.time_us
+        resolution = reader.resolution
         assert resolution is not None
         seq = content.seq if isinstance(content, EventPacket) else sequence
-        now_ns = log_time_ns if now_ns is None else now_ns
-        arrived = Arrived(events, resolution, log_time_ns, seq, source_ns, now_ns, until_us)
-        return self._take(arrived, is_late=seen.late, is_message=True)
+        heard_ns = log_time_ns if now_ns is None else now_ns
+        arrived = Arrived(events, resolution, log_time_ns, seq, source_ns, heard_ns, reader.time_us)
+        arrived.first_us, arrived.last_us = reader.span.tolist()
+        return self._take(arrived, reader.n_inside, is_late=seen.late, is_message=True)
 
-    def packet(self, packet: Packet) -> list[Packet | Label]:
+    def packet(self, packet: Packet) -> list[Item]:
         """Take in a packet of a camera file, and give what is certain now."""
-        log_time_ns, source_ns = packet.log_time_ns, packet.source_ns
-        events = np.require(packet.events, requirements=["C", "A", "W"])
-        about = events, packet.resolution, log_time_ns, packet.seq, source_ns, log_time_ns
-        return self._take(Arrived(*about, packet.until_us), is_late=False, is_message=False)
+        log_ns, events = packet.log_time_ns, np.require(packet.events, requirements=["C", "A", "W"])
+        about = events, packet.resolution, log_ns, packet.seq, packet.source_ns, log_ns
+        arrived = Arrived(*about, packet.until_us)
+        return self._take(arrived, arrived.measure(self._span), is_late=False, is_message=False)
 
     def label(self, label: Label) -> Iterable[Packet | Label]:
         """Take in a label: it comes out behind the packets before it."""
@@ -256,11 +257,10 @@ class Timeline:
         """Nothing follows: what is held was real."""
         return self._settled(None)
 
-    def _take(self, arrived: Arrived, *, is_late: bool, is_message: bool) -> list[Packet | Label]:
-        done: list[Packet | Label] = []
+    def _take(self, arrived: Arrived, n_inside: int, *, is_late: bool, is_message: bool) -> list[Item]:
+        done: list[Item] = []
         if self._held and arrived.now_ns - self._held.now_ns > HOLD_NS:
             done += self._settled(None)
-        n_inside = arrived.measure(self._span)
         if is_message and self._reader.encoding == "evt3" and self.reached_us is not None:
             placed_us = self.reached_us - self._clock.offset_us
             if self._held or n_inside < len(arrived.events) or arrived.may_have_wrapped(placed_us):

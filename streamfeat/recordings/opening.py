@@ -98,6 +98,8 @@ def _all_of(places: Sequence[Location]) -> Path:
 
 
 def _open_file(place: Location, topic: str | None, options: ReadOptions) -> Source:
+    if isinstance(place, Path) and place.exists() and not place.is_file():
+        raise InputError(f"{place}: is a pipe or device, and cannot be read twice; give the name of a file")
     with open_binary(place) as file:
         head = file.read(_HEAD_BYTES)
     ending = place.suffix.lower()

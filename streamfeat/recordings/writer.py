@@ -100,6 +100,7 @@ class RecordingWriter:
         frame_id: str = "",
         overwrite: bool = False,
         keep_partial: bool = False,
+        private: bool = False,
         part_suffix: str = ".part",
         chunk_size: int = 1 << 20,
     ) -> None:
@@ -114,6 +115,7 @@ class RecordingWriter:
             frame_id: frame in the header of every message.
             overwrite: whether an existing file at `path` may be replaced.
             keep_partial: whether an exception leaves what was written so far.
+            private: readable by this user alone, as what cameras see live should be.
             part_suffix: what the name of the temporary file has after `path`.
             chunk_size: bytes before compression that one damaged spot in the file can cost.
 
@@ -131,7 +133,7 @@ class RecordingWriter:
         self._reached_us: int | None = None
         self._ahead_us = 0
         self._check_target()
-        self._output = OutputFile(self.path, suffix=part_suffix, keep_leftover=True)
+        self._output = OutputFile(self.path, suffix=part_suffix, keep_leftover=True, private=private)
         self._writer = Writer(self._output.file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
         self._writer.start(profile="ros2", library="streamfeat")
 

@@ -66,12 +66,14 @@ def _encoder(encoder: Any) -> dict[str, Any]:
         "window": f"{g.n_bins} bins of {g.bin_us / 1000:g} ms",
         "volumes": f"stride {g.stride}, downsample {g.downsample}, counts up to {g.max_count}",
         "features": f"{encoder.n_features:,} in {g.pooling}x{g.pooling} cells",
+        "state": "narrow, sums of 16 bits" if encoder.is_narrow else "wide, sums of 32 bits",
         "learned from": ", ".join(map(str, encoder.provenance.get("recordings", []))) or "unknown",
     }
     shown = encoder.filters[:_MOST_FILTERS].reshape(-1, g.n_bins, g.patch, g.patch)
     # Bins beside each other, the oldest on the left.
     images = shown.transpose(0, 2, 1, 3).reshape(len(shown), g.patch, g.n_bins * g.patch)
-    line = [encoder.formulation, encoder.encoding, f"{filters} of {volume}", f"{g.window_us / 1000:g} ms"]
+    line = [encoder.formulation, encoder.encoding, *["narrow"] * encoder.is_narrow]
+    line += [f"{filters} of {volume}", f"{g.window_us / 1000:g} ms"]
     return {
         "line": [*line, f"{encoder.n_features:,} features"],
         "rows": rows,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 
 from streamfeat.errors import InputError
 from streamfeat.messages.packets import Label, Packet
-from streamfeat.stream.emission import Emission
+from streamfeat.stream.batch import EmissionBatch, Emitter
 from streamfeat.stream.session import Session, StreamItem
 from streamfeat.stream.state import SessionSnapshot, SessionStats
 
@@ -27,7 +27,7 @@ class CameraLeft:
     topic: str
 
 
-class Cameras:
+class Cameras(Emitter):
     """A session for each topic; takes items of all of them, in any order.
 
     An item that a session cannot use is refused and counted by reason, and the session starts anew with the
@@ -83,8 +83,8 @@ class Cameras:
         self._sessions[topic] = session
         self.seen += 1
 
-    def process(self, item: StreamItem | CameraLeft) -> Iterator[Emission]:
-        """Hand an item to the session of its topic, and yield the emissions on the way."""
+    def batches(self, item: StreamItem | CameraLeft, /) -> Iterator[EmissionBatch]:
+        """Hand an item to the session of its topic, and yield the emissions on the way in columns."""
         if isinstance(item, CameraLeft):
             yield from self._release(item.topic)
             return
@@ -98,9 +98,9 @@ class Cameras:
         if session is None:
             return
         try:
-            yield from session.process(item)
-        except InputError as error:
-            self._refuse(item.topic, "unusable", str(error))
+            yield from session.batches(item)
+        except (InputError, MemoryError) as error:
+            self._refuse(item.topic, _reason(error), str(error))
             self._past = _sum([self._past, session.stats()])
             del self._sessions[item.topic]
 
@@ -109,19 +109,19 @@ class Cameras:
         for session in self._sessions.values():
             session.rest()
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """End every stream."""
         for topic in self.topics:
             yield from self._release(topic)
 
-    def _release(self, topic: str) -> Iterator[Emission]:
+    def _release(self, topic: str) -> Iterator[EmissionBatch]:
         session = self._sessions.get(topic)
         if session is None:
             return
         try:
-            yield from session.finish()
-        except InputError as error:
-            self._refuse(topic, "unusable", str(error))
+            yield from session.last_batches()
+        except (InputError, MemoryError) as error:
+            self._refuse(topic, _reason(error), str(error))
         finally:
             self._past = _sum([self._past, session.stats()])
             del self._sessions[topic]
@@ -129,6 +129,11 @@ class Cameras:
     def _refuse(self, topic: str, reason: str, error: str) -> None:
         self.refused[reason] += 1
         self._on_refusal(topic, reason, error)
+
+
+def _reason(error: BaseException) -> str:
+    """Why a camera is refused; one for which there is no memory leaves that of the others alone."""
+    return "out of memory" if isinstance(error, MemoryError) else "unusable"
 
 
 def _sum(parts: list[SessionStats]) -> SessionStats:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 from streamfeat.engine.geometry import Geometry
 from streamfeat.messages.packets import Packet
-from streamfeat.stream.emission import Emission
+from streamfeat.stream.batch import EmissionBatch
 
 __all__ = ["Load"]
 
@@ -44,15 +44,15 @@ class Load:
         self._seconds = 0.0
         self.is_done = False
 
-    def timed(self, work: Iterator[Emission], packet: Packet) -> Iterator[Emission]:
+    def timed(self, work: Iterator[EmissionBatch], packet: Packet) -> Iterator[EmissionBatch]:
         """The same emissions; what they take is added up, what is done with them is not."""
         while True:
             started = self._clock()
-            emission = next(work, None)
+            batch = next(work, None)
             self._seconds += self._clock() - started
-            if emission is None:
+            if batch is None:
                 break
-            yield emission
+            yield batch
         if len(packet.events) and not self.is_done:
             self._add(packet)
 

@@ -42,6 +42,12 @@ class Outputs:
     table: Path | None = None
     more: Sink[Emission] | None = None
 
+    def reads_features(self, *, has_classifier: bool) -> bool:
+        """Whether any of them reads the features of emissions; a terminal does where nothing is predicted."""
+        everything = self.recording or self.table or self.more
+        lines = self.json_lines and self.with_features
+        return bool(everything or lines or (self.console and not has_classifier))
+
     def open(
         self,
         n_features: int,

@@ -23,7 +23,6 @@ import asyncio
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 from streamfeat.stream.pacing import Group, In, Pace, groups_of, stream_time
@@ -62,10 +61,10 @@ class PipelineStats:
 class Processor(Protocol[Taken, Made]):
     """Makes something of each item; is called from one thread at a time."""
 
-    def process(self, item: Taken, /) -> Iterator[Made]:
-        """Take in one item, and yield what comes of it."""
+    def batches(self, item: Taken, /) -> Iterator[Sequence[Made]]:
+        """Take in one item, and yield what comes of it, some at a time."""
 
-    def finish(self) -> Iterator[Made]:
+    def last_batches(self) -> Iterator[Sequence[Made]]:
         """Yield what is left when the items have ended."""
 
     def rest(self) -> None:
@@ -159,7 +158,7 @@ class _Traffic(Generic[In, Out]):
 
     Attributes:
         inbox: groups of items for the processor; None ends it.
-        outbox: emissions for the sinks; None ends it.
+        outbox: batches of emissions for the sinks; None ends it.
         stop: set to end the source.
         under_way: groups and parts that were handed on and are not done with.
         items: items read.
@@ -167,7 +166,9 @@ class _Traffic(Generic[In, Out]):
     """
 
     inbox: asyncio.Queue[list[In] | None] = field(default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS))
-    outbox: asyncio.Queue[list[Out] | None] = field(default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS))
+    outbox: asyncio.Queue[list[Sequence[Out]] | None] = field(
+        default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS)
+    )
     stop: asyncio.Event = field(default_factory=asyncio.Event)
     under_way: int = 0
     items: int = 0
@@ -231,22 +232,21 @@ class _Stages(_Connected[In, Out]):
         while more:
             group = await traffic.inbox.get()
             more = group is not None
-            emissions = _emissions(self._processor, group)
+            batches = _batches(self._processor, group)
             # One packet can give as many emissions as it has events: they are handed on in parts.
-            full = True
-            while full:
-                part = await self._threads.run(_take, emissions)
+            more_batches = True
+            while more_batches:
+                part, more_batches = await self._threads.run(_take, batches)
                 if part:
                     traffic.under_way += 1
                     await traffic.outbox.put(part)
-                full = len(part) == _EMISSIONS_A_HOP
             traffic.under_way -= 1
         await traffic.outbox.put(None)
 
     async def write(self) -> None:
         while (part := await self._traffic.outbox.get()) is not None:
             for sink in self._sinks:
-                await self._threads.run(sink.write, part)
+                await self._threads.run(_write, sink, part)
             self._traffic.under_way -= 1
 
 
@@ -262,22 +262,38 @@ class _Bypass(_Connected[In, Out]):
             # The other tasks can only finish what they have: the reader alone gives them more.
             if found.items and (found.more or self._traffic.under_way):
                 return found.items
-            emissions = _emissions(self._processor, found.items)
-            while part := _take(emissions):
+            for batch in _batches(self._processor, found.items):
                 for sink in self._sinks:
-                    sink.write(part)
+                    sink.write(batch)
             self._traffic.items += len(found.items)
             if not self._traffic.under_way:
                 self._processor.rest()
         return None
 
 
-def _emissions(processor: Processor[In, Out], group: list[In] | None) -> Iterator[Out]:
+def _batches(processor: Processor[In, Out], group: list[In] | None) -> Iterator[Sequence[Out]]:
     if group is None:
-        yield from processor.finish()
+        yield from processor.last_batches()
     else:
         for item in group:
-            yield from processor.process(item)
+            yield from processor.batches(item)
+
+
+def _take(batches: Iterator[Sequence[Out]]) -> tuple[list[Sequence[Out]], bool]:
+    """The next batches, as many as are worth a hop to another thread, and whether there may be more."""
+    taken: list[Sequence[Out]] = []
+    n = 0
+    for batch in batches:
+        taken.append(batch)
+        n += len(batch)
+        if n >= _EMISSIONS_A_HOP:
+            return taken, True
+    return taken, False
+
+
+def _write(sink: Sink[Out], batches: list[Sequence[Out]]) -> None:
+    for batch in batches:
+        sink.write(batch)
 
 
 def _close_all(sinks: Sequence[Sink[Out]], *, failed: bool) -> None:
@@ -290,7 +306,3 @@ def _close_all(sinks: Sequence[Sink[Out]], *, failed: bool) -> None:
             first = first or error
     if first:
         raise first
-
-
-def _take(emissions: Iterator[Out]) -> list[Out]:
-    return list(islice(emissions, _EMISSIONS_A_HOP))

@@ -120,7 +120,7 @@ class ReplayJob:
         """The pipeline of this replay into some sinks, with the recording open as long as the block runs."""
         started = time.perf_counter()
         self._report("compiling", 0, 1, "kernels, kept for the next time")
-        warm_up(self._encoder, self._policy)  # or the first emissions would be late
+        warm_up(self._encoder, self._policy, self._session.classifier)  # or the first emissions would be late
         self._report("compiling", 1, 1, "")
         self._compile_seconds = time.perf_counter() - started
         with self._opening() as rec:
@@ -148,6 +148,7 @@ class ReplayJob:
             InputError: an output cannot be written, or the recording not be read.
         """
         self._report = report
+        self._session.keep_features = outputs.reads_features(has_classifier=bool(self._labels))
         with ExitStack() as held:
 
             def sinks() -> Sequence[Sink[Emission]]:

@@ -20,7 +20,8 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.messages.packets import Label, Packet, Watermark
-from streamfeat.stream.emission import Emission, EmitPolicy
+from streamfeat.stream.batch import EmissionBatch, Emitter
+from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.load import Load
 from streamfeat.stream.state import SessionSnapshot, SessionState, SessionStats
 
@@ -28,15 +29,15 @@ __all__ = ["Session", "StreamItem"]
 
 StreamItem = Packet | Label | Watermark
 
-_TRACE = 32
-"""Events whose features are held at a time under `event`."""
+_TRACED, _TRACED_BYTES = 256, 1 << 20
+"""Events that are followed at a time under `event`: so many, and as many as their features may take."""
 _AHEAD_COLUMNS = 4096
 """Operator columns that are added at most to look ahead of a bin boundary: a fraction of a millisecond."""
 _AUTO_REST = 4.0
 """Under `auto`, time that passes after an emission, in multiples of what that emission took."""
 
 
-class Session:
+class Session(Emitter):
     """Feeds one camera's packets and labels to an engine, and emits features as the policy says.
 
     A labelled sample starts with an empty window and its own origin, so its features are those of the
@@ -64,6 +65,8 @@ class Session:
         engine: makes the engines, as `Engine` does; a subclass may observe what is done with one.
         denoising: noise that is taken out before anything is counted; no part of a snapshot.
         load: times the work of the first second, if somebody is to be told that it is too much.
+        keep_features: whether emissions under `event` have features, or scores alone, which takes less time;
+            may be changed before the first item.
         threads: of the engines, see `Engine`.
 
     Raises:
@@ -83,6 +86,7 @@ class Session:
         engine: Callable[..., Engine] = Engine,
         denoising: Denoising | None = None,
         load: Load | None = None,
+        keep_features: bool = True,
         threads: int = 1,
     ) -> None:
         """Check that the parts fit; the engine comes with the first packet."""
@@ -96,6 +100,7 @@ class Session:
         self.learner = OnlineClassifier(classifier.linear) if classifier and learn_online else None
         self._classifier = classifier
         self._clock, self._topic, self._load = clock, topic, load
+        self.keep_features = keep_features
         self._window_us = encoder.geometry.window_us
         self._is_behind = is_behind
         self._make_engine = partial(engine, threads=threads)
@@ -143,8 +148,8 @@ class Session:
         if snapshot.resolution and snapshot.engine:
             self._engine_for(snapshot.resolution).restore(snapshot.engine)
 
-    def process(self, item: StreamItem) -> Iterator[Emission]:
-        """Take in one item of the stream, and yield the emissions on the way."""
+    def batches(self, item: StreamItem, /) -> Iterator[EmissionBatch]:
+        """Take in one item of the stream, and yield the emissions on the way in columns."""
         if self.denoiser:
             item = self.denoiser.process(item)
         if isinstance(item, Watermark):
@@ -158,7 +163,7 @@ class Session:
             work = self._process_packet(item)
             yield from self._load.timed(work, item) if self._load and not self._load.is_done else work
 
-    def _process_packet(self, packet: Packet) -> Iterator[Emission]:
+    def _process_packet(self, packet: Packet) -> Iterator[EmissionBatch]:
         state = self._state
         if packet.epoch != state.epoch:
             yield from self._enter_epoch(packet.epoch)
@@ -171,13 +176,13 @@ class Session:
             return
         state.touch()
         engine = self._engine_for(packet.resolution)
-        valid = is_valid(events, packet.resolution)
-        latest = state.place(events["t"], valid, self._window_us)
+        latest, first_us = state.place(events, packet.resolution, self._window_us)
         end = len(events)
         if state.sample and state.sample_end_us is not None:
             end = int(np.searchsorted(latest, state.sample_end_us))
-            early = valid[:end] & (events["t"][:end] < state.sample.start_us)
-            if early.any():
+            if first_us < state.sample.start_us:
+                usable = is_valid(events[:end], packet.resolution)
+                early = usable & (events["t"][:end] < state.sample.start_us)
                 self._stats.late += int(np.count_nonzero(early))
                 kept = np.concatenate([~early, np.ones(len(events) - end, np.bool_)])
                 events, latest, end = events[kept], latest[kept], int(np.count_nonzero(kept[:end]))
@@ -193,7 +198,7 @@ class Session:
             self._engine.prepare(_AHEAD_COLUMNS)
             self._ahead_from = now + 2 * (self._clock() - now)
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """End the stream: the open sample has its final emission, and what was collected is learned."""
         self._source_ns = 0
         yield from self._finish_sample()
@@ -202,7 +207,7 @@ class Session:
         if self.learner:
             self.learner.flush()
 
-    def _enter_epoch(self, epoch: int) -> Iterator[Emission]:
+    def _enter_epoch(self, epoch: int) -> Iterator[EmissionBatch]:
         if self._state.epoch is None:
             self._state.epoch = epoch
             return
@@ -216,7 +221,7 @@ class Session:
         if self._engine:
             self._engine.restart(self._state.origin_us)
 
-    def _pass_time(self, t_us: int) -> Iterator[Emission]:
+    def _pass_time(self, t_us: int) -> Iterator[EmissionBatch]:
         """Emit what decays in silence, at bin boundaries or as the policy says, until the window is empty."""
         state, engine = self._state, self._engine
         if state.sample_end_us is not None and t_us >= state.sample_end_us:
@@ -238,7 +243,7 @@ class Session:
         self._engine = engine
         return engine
 
-    def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+    def _feed(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[EmissionBatch]:
         done = 0
         if self._every_event:
             done = yield from self._trace(engine, events, latest)
@@ -251,52 +256,56 @@ class Session:
 
     def _trace(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
-    ) -> Generator[Emission, None, int]:
+    ) -> Generator[EmissionBatch, None, int]:
         """One emission an event, until all are done or other items wait; returns how many were followed.
 
         Some events at a time, because that many calls from Python would cost far more.
         """
         start, before = 0, self._stats.events
+        current = self.classifier
+        classifier = current.linear if current else None
+        rows = _TRACED
+        if self.keep_features:
+            rows = min(rows, max(_TRACED_BYTES // (4 * self.encoder.n_features), 1))
         self._state.forget_due()
         while start < len(events) and not self._is_behind(self._log_time_ns):
-            traced = slice(start, min(start + _TRACE, len(events)))
-            features, accepted = engine.trace(events[traced])
-            self._state.take(0, int(latest[traced][-1]))
-            times, scores = latest[traced].tolist(), self._scores(features)
-            for i, n_events in enumerate(accepted.tolist()):
-                yield self._emission(times[i] + 1, before + n_events, features[i], scores[i])
+            traced = slice(start, min(start + rows, len(events)))
+            found = engine.trace(
+                events[traced],
+                classifier.folded if classifier else None,
+                keep_features=self.keep_features,
+            )
+            times = latest[traced]
+            self._state.take(0, int(times[-1]))
+            features = found.features if self.keep_features else np.zeros((len(times), 0), np.float32)
+            scores = classifier.emitted_after(found.scores) if classifier else found.scores
+            yield self._batch(times + 1, before + found.accepted, features, scores)
             self._state.unread = 0
             start = traced.stop
         return start
 
-    def _scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What the classifier says of features `(n, F)`: `(n, C)`, or `(n, 0)` without one."""
-        classifier = self.classifier
-        return classifier.emitted(features) if classifier else np.zeros((len(features), 0), np.float32)
-
-    def _emission(
+    def _batch(
         self,
-        t_us: int,
-        n_events: int,
+        t_us: NDArray[np.int64],
+        n_events: NDArray[np.int64],
         features: NDArray[np.float32],
         scores: NDArray[np.float32],
         *,
         final: bool = False,
-    ) -> Emission:
+    ) -> EmissionBatch:
         t_us, incomplete = self._state.emit(t_us)
-        self._stats.emissions += 1
-        self._stats.incomplete += incomplete
-        classifier = self.classifier
-        return Emission(
+        self._stats.emissions += len(t_us)
+        self._stats.incomplete += int(np.count_nonzero(incomplete))
+        return EmissionBatch(
             t_us=t_us,
             n_events=n_events,
             features=features,
-            labels=classifier.labels if classifier else (),
+            labels=self._classifier.labels if self._classifier else (),
             scores=scores,
+            incomplete=incomplete,
             sample=self._state.sample,
             final=final,
             topic=self._topic,
-            incomplete=incomplete,
             source_ns=self._source_ns,
             active_volumes=self._active_volumes(),
         )
@@ -305,7 +314,9 @@ class Session:
         """Counting them is nothing beside an emission, but much beside one event."""
         return self._engine.stats().active_volumes if self._engine and not self._every_event else None
 
-    def _feed_at_once(self, engine: Engine, events: Events, latest: NDArray[np.int64]) -> Iterator[Emission]:
+    def _feed_at_once(
+        self, engine: Engine, events: Events, latest: NDArray[np.int64]
+    ) -> Iterator[EmissionBatch]:
         self._take(engine, events, latest)
         self._state.forget_due()
         now = self._clock()
@@ -316,7 +327,7 @@ class Session:
 
     def _feed_by_count(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
-    ) -> Generator[Emission, None, int]:
+    ) -> Generator[EmissionBatch, None, int]:
         """Feed and emit until all are done, or other items wait; returns how many were fed."""
         start = 0
         self._state.forget_due()
@@ -330,7 +341,7 @@ class Session:
 
     def _feed_by_time(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]
-    ) -> Generator[Emission, None, int]:
+    ) -> Generator[EmissionBatch, None, int]:
         """Feed and emit until all are done, or other items wait; returns how many were fed."""
         start = 0
         while start < len(events) and not self._is_behind(self._log_time_ns):
@@ -348,21 +359,24 @@ class Session:
         engine.feed(events)
         self._state.take(len(events), int(latest[-1]))
 
-    def _emit(self, engine: Engine, t_us: int, *, final: bool = False) -> Emission:
+    def _emit(self, engine: Engine, t_us: int, *, final: bool = False) -> EmissionBatch:
         engine.advance(t_us - 1)
-        features = engine.features()
+        features = engine.features()[np.newaxis]
         self._state.unread = 0
-        scores = self._scores(features[np.newaxis])[0]
-        return self._emission(t_us, self._stats.events + engine.n_events, features, scores, final=final)
+        classifier, n_events = self.classifier, self._stats.events + engine.n_events
+        scores = classifier.emitted(features) if classifier else np.zeros((1, 0), np.float32)
+        times = np.array([t_us], np.int64)
+        return self._batch(times, np.array([n_events], np.int64), features, scores, final=final)
 
-    def _finish_sample(self) -> Iterator[Emission]:
+    def _finish_sample(self) -> Iterator[EmissionBatch]:
         sample = self._state.sample
         if sample is None:
             return
         self._stats.samples += 1
         geometry = self.encoder.geometry
         engine = self._engine or self._engine_for((geometry.patch * geometry.downsample,) * 2)
-        emission = self._emit(engine, sample.start_us + sample.duration_us, final=True)
+        batch = self._emit(engine, sample.start_us + sample.duration_us, final=True)
+        emission = batch[0]
         if emission.correct and self._stats.correct is not None:
             self._stats.correct += 1
         if self.learner:
@@ -371,7 +385,7 @@ class Session:
             else:
                 self._stats.unknown_labels += 1
         self._state.close_sample()
-        yield emission
+        yield batch
 
 
 def _add_engine(stats: SessionStats, engine: Engine) -> None:

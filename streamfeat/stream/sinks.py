@@ -19,9 +19,10 @@ from streamfeat.errors import InputError
 from streamfeat.files.atomic import unwritable
 from streamfeat.files.outputs import OutputFile
 from streamfeat.recordings.writer import RecordingWriter
+from streamfeat.stream.batch import EmissionBatch, batches_of
 from streamfeat.stream.emission import Emission
 
-__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_record", "open_sinks"]
+__all__ = ["JsonLinesSink", "RecordingSink", "Sink", "TerminalSink", "emission_records", "open_sinks"]
 
 _LINES_A_SECOND = 4.0
 _FILTERS_SHOWN = 3
@@ -62,29 +63,31 @@ def open_sinks(*makers: Callable[[], S] | None) -> list[S]:
     return sinks
 
 
-def emission_record(emission: Emission, *, features: bool = False) -> dict[str, Any]:
-    """An emission as JSON values."""
-    record: dict[str, Any] = {"t_us": emission.t_us, "n_events": emission.n_events}
-    if emission.topic:
-        record["topic"] = emission.topic
-    if emission.incomplete:
-        record["incomplete"] = True
-    if emission.labels:
-        record["prediction"] = emission.prediction
-        record["scores"] = {
-            label: round(float(score), 6)
-            for label, score in zip(emission.labels, emission.scores, strict=True)
-        }
-    if emission.sample:
-        record["sample"] = {
-            "label": emission.sample.label,
-            "elapsed_us": emission.t_us - emission.sample.start_us,
-            "source": emission.sample.source,
-            "final": emission.final,
-        }
-    if features:
-        record["features"] = [float(value) for value in emission.features]
-    return record
+def emission_records(batch: EmissionBatch, *, features: bool = False) -> Iterator[dict[str, Any]]:
+    """Emissions as JSON values."""
+    sample, names = batch.sample, batch.predictions
+    scores, missing = batch.scores.tolist(), batch.incomplete.tolist()
+    for i, (t_us, n_events) in enumerate(zip(batch.t_us.tolist(), batch.n_events.tolist(), strict=True)):
+        record: dict[str, Any] = {"t_us": t_us, "n_events": n_events}
+        if batch.topic:
+            record["topic"] = batch.topic
+        if missing[i]:
+            record["incomplete"] = True
+        if batch.labels:
+            record["prediction"] = names[i]
+            record["scores"] = {
+                label: round(score, 6) for label, score in zip(batch.labels, scores[i], strict=True)
+            }
+        if sample:
+            record["sample"] = {
+                "label": sample.label,
+                "elapsed_us": t_us - sample.start_us,
+                "source": sample.source,
+                "final": batch.final,
+            }
+        if features:
+            record["features"] = batch.features[i].tolist()
+        yield record
 
 
 class JsonLinesSink:
@@ -106,7 +109,12 @@ class JsonLinesSink:
         Raises:
             InputError: the disk is full, or the target cannot be written for another reason.
         """
-        lines = (json.dumps(emission_record(e, features=self._features)) + "\n" for e in emissions)
+        records = (
+            record
+            for batch in batches_of(emissions)
+            for record in emission_records(batch, features=self._features)
+        )
+        lines = (json.dumps(record) + "\n" for record in records)
         with self._explaining():
             if self._stream:
                 self._stream.writelines(lines)

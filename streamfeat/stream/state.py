@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.snapshot import Snapshot
 from streamfeat.errors import InputError
-from streamfeat.events import TIME_LIMIT, Resolution
+from streamfeat.events import TIME_LIMIT, Events, Resolution
 from streamfeat.files.json_fields import Fields
+from streamfeat.kernels.decode import place_events
 from streamfeat.messages.packets import Label
 
 __all__ = ["SessionSnapshot", "SessionState", "SessionStats"]
@@ -139,23 +140,27 @@ class SessionState:
         self.lost = self.sample is None
         self.epoch = epoch
 
-    def place(self, t: NDArray[np.int64], valid: NDArray[np.bool_], window_us: int) -> NDArray[np.int64]:
+    def place(self, events: Events, resolution: Resolution, window_us: int) -> tuple[NDArray[np.int64], int]:
         """Stream time after each event of a packet: it never goes back, and invalid events have no say.
 
         What is missing came before this packet, so it has left the window one window after its first event.
 
         Args:
-            t: `(n,)` int64 microseconds, n > 0; not changed.
-            valid: `(n,)` bool.
+            events: `(n,)` of the packet, n > 0; not changed.
+            resolution: of the sensor.
             window_us: length of the window.
+
+        Returns:
+            stream time `(n,)` int64 microseconds, and the time of the earliest event that can be used.
         """
-        if not valid.all():
-            t = np.where(valid, t, -TIME_LIMIT)
-        latest = np.maximum(np.maximum.accumulate(t), self.last_us)
+        if not (events.flags.writeable and events.flags.c_contiguous):
+            events = events.copy()  # one compiled kernel serves all
+        latest, span = np.empty(len(events), np.int64), np.full(2, TIME_LIMIT, np.int64)
+        place_events(events, *resolution, self.last_us, latest, span)
         if self.lost:
             self.incomplete_us = max(self.incomplete_us, int(latest[0]) + window_us)
             self.lost = False
-        return latest
+        return latest, int(span[0])
 
     def take(self, n_events: int, last_us: int) -> None:
         """Events were fed that reach so far."""
@@ -189,10 +194,10 @@ class SessionState:
         """What follows is not emitted by time; the next due emission follows from stream time."""
         self.next_us = None
 
-    def emit(self, t_us: int) -> tuple[int, bool]:
-        """The stream time of an emission, and whether packets are known to be missing from its window."""
+    def emit(self, t_us: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Stream times of emissions `(n,)`, and whether packets are known to be missing from each."""
         # After emissions in silence, stream time as told by events may lie behind them.
-        t_us = max(t_us, self.silent_us)
+        t_us = np.maximum(t_us, self.silent_us)
         return t_us, t_us <= self.incomplete_us
 
     def resumed(self, every_us: int) -> Self:

@@ -6,7 +6,7 @@ Not here: other sinks (`sinks`), and features of samples in memory (`features`).
 
 import importlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.files.atomic import unwritable
 from streamfeat.files.outputs import OutputFile
+from streamfeat.stream.batch import EmissionBatch, batches_of
 from streamfeat.stream.emission import Emission
 
 __all__ = ["TableSink"]
@@ -45,7 +46,7 @@ class TableSink:
     def __init__(self, path: Path, n_features: int, labels: Sequence[str] = ()) -> None:
         """Open the file."""
         self._n_features = n_features
-        self._waiting: list[Emission] = []
+        self._waiting: list[EmissionBatch] = []
         self._pa = _library("pyarrow", path)
         self._schema = self._make_schema(labels)
         is_parquet = path.suffix.lower() == ".parquet"
@@ -63,8 +64,8 @@ class TableSink:
         Raises:
             InputError: the disk is full, or whatever else keeps the file from being written.
         """
-        self._waiting += emissions
-        if len(self._waiting) * self._n_features * 4 >= _GROUP_BYTES:
+        self._waiting += batches_of(emissions)
+        if sum(map(len, self._waiting)) * self._n_features * 4 >= _GROUP_BYTES:
             with self._explaining():
                 self._write_group()
 
@@ -114,24 +115,35 @@ class TableSink:
         return pa.schema(list(columns.items()), metadata={"labels": json.dumps(list(labels))})
 
     def _write_group(self) -> None:
-        pa, rows = self._pa, self._waiting
+        pa, batches = self._pa, self._waiting
         self._waiting = []
-        samples = [e.sample for e in rows]
-        values: dict[str, list[Any]] = {
-            "t_us": [e.t_us for e in rows],
-            "n_events": [e.n_events for e in rows],
-            "topic": [e.topic for e in rows],
-            "incomplete": [e.incomplete for e in rows],
-            "prediction": [e.prediction for e in rows],
-            "scores": [e.scores for e in rows],
-            "label": [s and s.label for s in samples],
-            "split": [s and s.split for s in samples],
-            "source": [s and s.source for s in samples],
-            "elapsed_us": [e.t_us - e.sample.start_us if e.sample else None for e in rows],
-            "final": [e.final for e in rows],
+        lengths = list(map(len, batches))
+
+        def same(values: Iterable[Any]) -> list[Any]:
+            """What is the same for all rows of a batch, row by row."""
+            return [value for value, n in zip(values, lengths, strict=True) for _ in range(n)]
+
+        samples = [b.sample for b in batches]
+        starts = [s.start_us if s else None for s in samples]
+        values: dict[str, Any] = {
+            "t_us": np.concatenate([b.t_us for b in batches]),
+            "n_events": np.concatenate([b.n_events for b in batches]),
+            "topic": same(b.topic for b in batches),
+            "incomplete": np.concatenate([b.incomplete for b in batches]),
+            "prediction": [name for b in batches for name in b.predictions],
+            "scores": [row for b in batches for row in b.scores],
+            "label": same(s and s.label for s in samples),
+            "split": same(s and s.split for s in samples),
+            "source": same(s and s.source for s in samples),
+            "elapsed_us": [
+                None if start is None else t_us - start
+                for b, start in zip(batches, starts, strict=True)
+                for t_us in b.t_us.tolist()
+            ],
+            "final": same(b.final for b in batches),
         }
         arrays = [pa.array(column, self._schema.field(name).type) for name, column in values.items()]
-        flat = pa.array(np.concatenate([e.features for e in rows]))
+        flat = pa.array(np.concatenate([b.features.ravel() for b in batches]))
         arrays.append(pa.FixedSizeListArray.from_arrays(flat, self._n_features))
         self._writer.write_batch(pa.record_batch(arrays, schema=self._schema))
 

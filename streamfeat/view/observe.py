@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.engine import Engine, EngineStats
+from streamfeat.engine.trace import Trace
 from streamfeat.events import Events, Resolution
+from streamfeat.kernels.predict import Weights
 
 __all__ = ["ObservedEngine", "Sight", "Slot", "Throttle", "Updates", "Watch"]
 
@@ -163,10 +165,10 @@ class ObservedEngine(Engine):
         self._batches.clear()
         self._kept, self._now_us = 0, origin_us
 
-    def trace(self, batch: Events) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def trace(self, batch: Events, weights: Weights | None = None, *, keep_features: bool = True) -> Trace:
         """As `Engine.trace`, timed."""
         started = time.perf_counter_ns()
-        traced = super().trace(batch)
+        traced = super().trace(batch, weights, keep_features=keep_features)
         self._note(started, len(batch))
         self._remember(batch)
         self._look()

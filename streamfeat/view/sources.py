@@ -26,6 +26,7 @@ from streamfeat.live.warnings import Warnings
 from streamfeat.messages.packets import Label, Packet, Watermark
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Recording, open_recording
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline, Processor
 from streamfeat.stream.replay import items_of_split
@@ -43,11 +44,11 @@ _WINDOW_US = 100_000
 class NoFeatures:
     """Lets items pass, and makes nothing of them."""
 
-    def process(self, item: object, /) -> Iterator[Emission]:
+    def batches(self, item: object, /) -> Iterator[EmissionBatch]:
         """Yield nothing."""
         return iter(())
 
-    def finish(self) -> Iterator[Emission]:
+    def last_batches(self) -> Iterator[EmissionBatch]:
         """Yield nothing."""
         return iter(())
 

@@ -26,6 +26,7 @@ from streamfeat.messages.cdr import EventPacket
 from streamfeat.messages.codecs import encode
 from streamfeat.messages.packets import Packet, Watermark
 from streamfeat.messages.timeline import Timeline
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline
 from streamfeat.stream.session import Session
@@ -116,17 +117,17 @@ class _Watch:
         self._checks = 0
         self._last_us = 0
 
-    def process(self, item: Packet | Watermark) -> Iterator[Emission]:
+    def batches(self, item: Packet | Watermark) -> Iterator[EmissionBatch]:
         """Time what the session does with an item, and look from time to time."""
         cpu, wall = 0.0, 0.0
-        emissions = self.session.process(item)
+        made = self.session.batches(item)
         while True:
             before = time.thread_time(), time.perf_counter()
-            emission = next(emissions, None)
+            batch = next(made, None)
             cpu, wall = cpu + time.thread_time() - before[0], wall + time.perf_counter() - before[1]
-            if emission is None:
+            if batch is None:
                 break
-            yield emission
+            yield batch
         if not isinstance(item, Packet):
             return
         self._recent.append(item)
@@ -140,8 +141,8 @@ class _Watch:
             self._check()
             self._trials.say(f"soak {self._n:,}/{self._packets:,} packets")
 
-    def finish(self) -> Iterator[Emission]:
-        yield from self.session.finish()
+    def last_batches(self) -> Iterator[EmissionBatch]:
+        yield from self.session.last_batches()
 
     def rest(self) -> None:
         self.session.rest()

@@ -99,13 +99,18 @@ class Bench:
 def features(bench: Bench) -> Iterator[Row]:
     """`features()` every 10 ms."""
     for name, goal in {"DAVIS": 4.0, "VGA": 4.0, "HD": 3.5, "N-CARS": 2.5}.items():
-        task = bench.camera(CAMERAS[name])
-        found = compared(bench.trees, bench.rounds, {"before": task, "now": task})
-        digests = {result["digest"] for results in found.values() for result in results}
+        task, camera = bench.camera(CAMERAS[name]), CAMERAS[name]
+        geometry = {"stride": camera.stride, "downsample": camera.downsample}
+        model = bench.model(f"{name}-narrow", "now", geometry=geometry, filters=K, narrow=True)
+        tasks = {"before": task, "now": task, "now, narrow": task | {"model": model}}
+        found = compared(bench.trees, bench.rounds, tasks)
+        digests = {result["digest"] for name in ("before", "now") for result in found[name]}
         bits = "same bits" if len(digests) == 1 else "BITS DIFFER"
         yield _ratio(
             f"`features()` every 10 ms, {name}", goal, found, "features.", f", {bits}", len(digests) == 1
         )
+        narrow = {"before": found["before"], "now": found["now, narrow"]}
+        yield _ratio(f"the same with a model of the narrow state, {name}", goal, narrow, "features.")
 
 
 def replays(bench: Bench) -> Iterator[Row]:
@@ -136,7 +141,8 @@ def single_events(bench: Bench) -> Iterator[Row]:
         burst = events.burst(geometry, 2000)
         task = _burst(bench, "follow", burst) | {"repeats": 20}
         tasks = {
-            name: task | {"model": bench.model(f"own-{k}", name, geometry={"stride": 4}, filters=k)}
+            name: task
+            | {"model": bench.model(f"own-{k}", name, geometry={"stride": 4}, filters=k, narrow=True)}
             for name in ("before", "now")
         }
         found = compared(bench.trees, bench.rounds, tasks)

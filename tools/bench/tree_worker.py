@@ -43,6 +43,7 @@ class Watch:
 def make_model(task: dict[str, Any]) -> dict[str, Any]:
     """Write a direct model, and an untrained classifier for it where one is asked for.
 
+    The state is narrow where that is asked for and the version has one.
     Filters are random; or an inverse model is made of the `arrays` of one that was learned.
     """
     import numpy as np
@@ -61,6 +62,8 @@ def make_model(task: dict[str, Any]) -> dict[str, Any]:
         eye, zeros = np.eye(geometry.entries, dtype=np.float32), np.zeros(geometry.entries, np.float32)
         arrays = {"filters": filters.astype(np.float32), "whitening": eye, "mean": zeros}
         kind = {"formulation": "direct", "encoding": "split", "threshold": 1.0}
+    if task.get("narrow") and hasattr(sf.Encoder, "is_narrow"):
+        kind["narrow"] = True
     encoder = sf.Encoder.build(geometry, **kind, **arrays)
     encoder.save(task["model"])
     if "classifier" in task:

@@ -1,10 +1,11 @@
-"""Measure what a packet costs in Python between the inbox and the session.
+"""Measure what a packet costs between the inbox and the session, and until its events are counted.
 
 python tools/live_bench/packets.py
 python tools/live_bench/packets.py --against ../before    # a work tree of another commit, taking turns
 
-No network and no features: messages of 100 events are parsed, judged, decoded and placed. Processes of both
-trees take turns; the median of each and their ratio are printed as JSON.
+No network and no features: messages of 100 events are parsed, judged, decoded and placed; `counted` ones go
+through the job's figures and a session into an engine, too. Processes of both trees take turns; microseconds
+of processor time, the median of each tree and their ratio, are printed as JSON.
 """
 
 import argparse
@@ -13,13 +14,19 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-CASES = {f"{encoding} {how}": (encoding, how) for encoding in ("mono", "evt3") for how in ("named", "bare")}
-"""Encoding of the payload, and whether messages name their publisher."""
+CASES = {
+    f"{encoding} {how}": (encoding, how)
+    for encoding in ("mono", "evt3")
+    for how in ("named", "bare", "counted")
+}
+"""Encoding of the payload, and whether messages name their publisher or not, or are counted in an engine."""
 _PACKETS, _EVENTS, _ROUNDS = 2000, 100, 7
 
 
@@ -72,7 +79,7 @@ def _measure(encoding: str, how: str) -> float:
         x, y, p = (rng.integers(0, most, _EVENTS) for most in (346, 260, 2))
         payload, base_ns = encode(make_events(x, y, p, t), encoding)
         about = int(t[0]) * 1000, "camera", 260, 346, i, base_ns, encoding, False
-        attached = Attachment(i + 1, 5, b"1" * 16).pack() if how == "named" else b""
+        attached = Attachment(i + 1, 5, b"1" * 16).pack() if how != "bare" else b""
         data = EventPacket(*about, payload).to_cdr()
         now_ns = i * 1_000_000
         messages.append(RawMessage("cam/events", EventPacket.SCHEMA_NAME, data, attached, now_ns, now_ns))
@@ -83,11 +90,40 @@ def _measure(encoding: str, how: str) -> float:
             inbox.put(message)
         inbox.close()
         intake = module.Intake(inbox, 100_000, module.Warnings())
-        started = time.perf_counter()
-        n = sum(isinstance(item, Packet) for item in intake)
-        rounds.append(1e6 * (time.perf_counter() - started) / n)
+        process = _counting() if how == "counted" else lambda item: None
+        started, n = time.thread_time(), 0
+        for item in intake:
+            if item is not None:
+                process(item)
+                n += isinstance(item, Packet)
+        rounds.append(1e6 * (time.thread_time() - started) / n)
         assert n == _PACKETS
     return float(np.median(rounds[1:]))
+
+
+def _counting() -> Callable[[Any], None]:
+    """What a job does with an item until its events are counted; nothing is ever emitted."""
+    from streamfeat.engine.geometry import Geometry
+    from streamfeat.engine.random_encoder import random_encoder
+    from streamfeat.live.health import Health
+    from streamfeat.live.inbox import Inbox
+    from streamfeat.live.intake import Intake
+    from streamfeat.live.warnings import Warnings
+    from streamfeat.stream.cameras import Cameras
+    from streamfeat.stream.emission import EmitPolicy
+    from streamfeat.stream.session import Session
+
+    encoder = random_encoder(0, Geometry(patch=12, stride=4, n_bins=3, bin_us=33_334), 32, encoding="split")
+    policy, warnings, inbox = EmitPolicy.parse("100000000ev"), Warnings(), Inbox()
+    cameras = Cameras(lambda topic: Session(encoder, policy, clock=time.perf_counter, topic=topic))
+    health = Health(cameras, Intake(inbox, 100_000, warnings), inbox, warnings)
+    made = getattr(health, "batches", health.process)  # versions before batches made emissions one by one
+
+    def process(item: Any) -> None:
+        for _ in made(item):
+            pass
+
+    return process
 
 
 if __name__ == "__main__":
