@@ -852,6 +852,30 @@ PROJECT_VOLUME = FORMS | {
     "ahead": lambda call: call.ahead == 1,
     "volumes share a row": _shares_rows,
 }
+LET_IN = {
+    "waits": lambda call: call.result[1] > call.waiting,
+    "projected by columns": lambda call: call.result == (call.result[0], call.waiting) and call.result[0] > 0,
+    "an empty volume over one that was not": lambda call: call.result[0] == 0,
+    "ahead": lambda call: call.ahead == 1,
+    "waits, ahead": lambda call: call.ahead == 1 and call.result[1] > call.waiting,
+}
+MULTIPLY = {
+    "nothing": lambda call: call.waiting == 0,
+    "whole tiles": lambda call: call.waiting > 0 and call.waiting % 6 == 0,
+    "a tile worth filling up": lambda call: call.waiting % 6 in (4, 5),
+    "some by columns": lambda call: call.waiting % 6 in (1, 2, 3),
+    "of the plane ahead": lambda call: call.plane != call.state.clock[CLOCK_PLANE],
+    "an odd number of entries": lambda call: len(call.operator.columns) % 2 == 1,
+    "several blocks of filters": lambda call: call.operator.columns.shape[1] > 32,
+}
+SHARE_OF_LOAD = {
+    "nothing": lambda call: call.state.clock[CLOCK_DIRTY] == 0,
+    "all of it": lambda call: call.parts == 1 and call.state.clock[CLOCK_DIRTY] > 0,
+    "a part": lambda call: call.parts > 1 and call.result[1] > call.result[0],
+    "not where equally many volumes would be cut": lambda call: (
+        call.result != naive.share_of(call.part, call.parts, call.state)
+    ),
+}
 COMPLETE = {
     "the upper part": lambda call: call.part == 0,
     "the lower part": lambda call: call.part == 1,
@@ -1280,6 +1304,9 @@ CASES = {
     "pool_volume": POOL_VOLUME,
     "enter_code": ENTER_CODE,
     "project_volume": PROJECT_VOLUME,
+    "let_in": LET_IN,
+    "multiply": MULTIPLY,
+    "share_of_load": SHARE_OF_LOAD,
     "complete": COMPLETE,
     "look_ahead": LOOK_AHEAD,
     "change_place": CHANGE_PLACE,

@@ -22,6 +22,7 @@ from streamfeat.kernels import (
     code,
     decode,
     denoise,
+    dense,
     encode,
     file_codes,
     follow,
@@ -67,6 +68,9 @@ SCRATCH = {
     "active",
     "corners",
     "values",
+    "windows",
+    "awaiting",
+    "load",
     "entries",
     "changes",
     "sums",
@@ -150,6 +154,15 @@ def exact_but_scratch(kernel: Run, twin: Run) -> None:
         assert_same(mine, yours, scratch=SCRATCH)
 
 
+def exact_waiting(kernel: Run, twin: Run) -> None:
+    """As above, and the volume that waits, if it does, with its entries."""
+    exact_but_scratch(kernel, twin)
+    waiting, part = kernel.before[3:5]
+    for name in ("awaiting", "windows") if kernel.result[1] > waiting else ():
+        mine, yours = (getattr(run.after[-1], name)[part, waiting] for run in (kernel, twin))
+        assert_same(mine, yours)
+
+
 def exact_but_atoms(kernel: Run, twin: Run) -> None:
     """As above; lasso codes are each within the gap, and what was pooled is what they are."""
     operator, state = kernel.after[-2:]
@@ -191,6 +204,7 @@ def exact_list(kernel: Run, twin: Run) -> None:
     mine, yours = (run.after[-1] for run in (kernel, twin))
     n = mine.clock[CLOCK_DIRTY]
     assert_same(mine.dirty[:n], yours.dirty[:n])
+    assert_same(mine.load[: n + 1], yours.load[: n + 1])
 
 
 def exact_but_features(kernel: Run, twin: Run) -> None:
@@ -892,6 +906,8 @@ def one_row(state):
         pooled=np.zeros_like(state.pooled[:1]),
         clock=clock,
         partial=np.zeros_like(state.partial[:, :1]),
+        windows=state.windows[:, :0].copy(),
+        awaiting=state.awaiting[:, :0].copy(),
     )
 
 
@@ -947,6 +963,44 @@ def make_project_volume(rng):
 def make_enter_atoms(rng):
     operator, state = parts_of(read_engine(rng))
     return operator.wide, *random_row(rng, state), random_part(rng, state), operator, state
+
+
+CLOSED_KINDS = [("direct", "soft"), ("direct", "split")]
+
+
+def make_can_wait(rng):
+    state = parts_of(read_engine(rng))[1]
+    return (one_row(state) if rng.random() < 0.3 else state,)
+
+
+def make_let_in(rng):
+    operator, state = parts_of(read_engine(rng, CLOSED_KINDS))
+    plane, volume = random_row(rng, state)
+    if rng.random() < 0.4:  # more entries that are not zero than random events leave
+        state.applied[:] = random_ring(rng, operator, state)
+    if rng.random() < 0.2:
+        state.applied[:] = 0
+    ahead = int(plane != state.clock[CLOCK_PLANE])
+    waiting = int(rng.integers(0, state.awaiting.shape[1]))
+    state.windows[:] = 7  # of volumes that waited before
+    return plane, volume, ahead, waiting, random_part(rng, state), operator, state
+
+
+def random_ring(rng, operator, state):
+    limit = operator.max_count
+    ring = rng.integers(-limit, limit + 1, state.applied.shape)
+    ring[rng.random(ring.shape) < rng.random()] = 0
+    return ring
+
+
+def make_multiply(rng):
+    operator, state = parts_of(read_engine(rng, CLOSED_KINDS))
+    plane, part = int(rng.integers(0, len(state.cursors))), random_part(rng, state)
+    waiting = int(rng.integers(0, min(state.awaiting.shape[1], naive.volumes_of(operator)) + 1))
+    state.awaiting[part, :waiting] = rng.permutation(naive.volumes_of(operator))[:waiting]
+    for window in state.windows[part, :waiting]:
+        window[: len(operator.columns)] = random_values(rng, operator)
+    return plane, waiting, part, operator, state
 
 
 def make_enter_code(rng):
@@ -1042,6 +1096,11 @@ def make_renew(rng):
     operator, state = engine_with_news(rng)
     naive.mark_dirty(operator, state)
     return *random_share(rng, state), operator, state
+
+
+def make_share_of_load(rng):
+    part, parts, _, state = make_complete(rng)
+    return part, parts, state
 
 
 def make_share_of(rng):
@@ -1634,12 +1693,16 @@ KERNELS = [
     Row(narrow.move_rows, make_move_rows),
     Row(narrow.move_queued, make_move_queued, exact_but_scratch),
     Row(narrow.queue_volume, make_queue_volume, exact_once_moved),
+    Row(dense.can_wait, make_can_wait),
+    Row(dense.let_in, make_let_in, exact_waiting),
+    Row(dense.multiply, make_multiply, exact_but_scratch),
     Row(planes.project_volume, make_project_volume, exact_but_scratch),
     Row(planes.enter_atoms, make_enter_atoms, exact_but_responses),
     Row(planes.enter_code, make_enter_code, exact_but_scratch),
     Row(planes.count_filled, make_count_filled, exact_but_lines),
     Row(planes.list_missing, make_list_missing, exact_list),
     Row(planes.share_of, make_share_of),
+    Row(planes.share_of_load, make_share_of_load),
     Row(planes.finish, make_finish),
     Row(planes.fill_plane, make_fill_plane, exact_but_atoms),
     Row(planes.complete, make_complete, exact_but_atoms_of_a_part),

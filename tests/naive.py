@@ -766,6 +766,36 @@ def enter_atoms(wide, plane, row, part, operator, state):
         atoms[1] = operator.gram.astype(np.float64) @ atoms[0]
 
 
+# streamfeat.kernels.dense
+
+
+def can_wait(state):
+    return state.awaiting.shape[1] > 0
+
+
+def let_in(plane, volume, ahead, waiting, part, operator, state):
+    values = _gather(state.applied, ahead, volume, operator, state)
+    n, before = int(np.count_nonzero(values)), state.projections[plane, volume].copy()
+    projection, state.moments[plane, volume] = sums_of(values, operator)
+    if n <= 0.4 * len(values):
+        state.projections[plane, volume] = projection
+        return n, waiting
+    state.projections[plane, volume] = before
+    state.windows[part, waiting] = 0
+    state.windows[part, waiting, : len(values)] = values
+    state.awaiting[part, waiting] = volume
+    return n, waiting + 1
+
+
+def multiply(plane, waiting, part, operator, state):
+    for volume, window in zip(state.awaiting[part, :waiting], state.windows[part], strict=False):
+        values = window[: len(operator.columns)].astype(np.int64)
+        state.projections[plane, volume] = values @ operator.columns
+
+
+# streamfeat.kernels.planes, after the projection
+
+
 def enter_code(plane, volume, part, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
     if not state.moments[plane, row].any():
@@ -792,6 +822,22 @@ def list_missing(operator, state):
             missing.append(volume)
     state.dirty[: len(missing)] = missing
     state.clock[CLOCK_DIRTY] = len(missing)
+    work = [40 + _filled_pixels(volume, operator, state) for volume in missing]
+    state.load[: len(missing) + 1] = np.cumsum([0, *work])
+
+
+def _filled_pixels(volume, operator, state):
+    windows = _gather(state.applied, 0, volume, operator, state).reshape(len(state.applied), -1)
+    return int(windows.any(axis=0).sum())
+
+
+def share_of_load(part, parts, state):
+    n = int(state.clock[CLOCK_DIRTY])
+    load = state.load[: n + 1].astype(float)
+    if n == 0:
+        return 0, 0
+    cuts = [int(np.searchsorted(load[:n], load[n] * i / parts - 1e-6)) for i in range(parts + 1)]
+    return cuts[part], cuts[part + 1]
 
 
 def share_of(part, parts, state):
@@ -803,7 +849,7 @@ def share_of(part, parts, state):
 def complete(part, parts, operator, state):
     plane = int(state.clock[CLOCK_PLANE])
     cursors, everything = state.cursors[plane], len(operator.columns)
-    for volume in state.dirty[slice(*share_of(part, parts, state))].tolist():
+    for volume in state.dirty[slice(*share_of_load(part, parts, state))].tolist():
         if volume >= cursors[CURSOR_PROJECTED]:
             project_volume(plane, volume, 0, 0, everything, part, operator, state)
         enter_code(plane, volume, part, operator, state)

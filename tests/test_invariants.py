@@ -2,6 +2,7 @@
 
 import copy
 import runpy
+from dataclasses import replace
 
 import naive
 import numpy as np
@@ -149,6 +150,20 @@ def test_features_are_those_of_the_window_on_streams_that_cross_many_bins(kind):
         case = known_case(kind)
         events = random_events(np.random.default_rng(seed), case.geometry, case.resolution, 120)
         assert_every_way_agrees(case, events, 0, seed)
+
+
+@pytest.mark.parametrize("threads_", [1, 2])
+@pytest.mark.parametrize("encoding", ["soft", "split"])
+def test_features_are_those_of_the_window_where_volumes_are_full(encoding, threads_):
+    """Their projections are a product (`kernels.dense`), those of others are sums of columns."""
+    case = replace(known_case(("direct", encoding), n_filters=40, stride=1), threads=threads_)
+    events = random_events(np.random.default_rng(5), case.geometry, case.resolution, 700, n_windows=1.3)
+    engine = case.engine()
+    engine.feed(events)
+    engine.features()
+    waited = sum(len(set(volumes.tolist())) > 1 for volumes in engine._state.awaiting)
+    assert waited == threads_
+    assert_every_way_agrees(case, events, 0, 5)
 
 
 @pytest.mark.parametrize("kind", LASSO_KINDS, ids=ids)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from torture import __main__ as torture
-from torture import crowd, kills, soak
+from torture import crowd, kills, outside, soak
 from torture.nursery import Nursery
 from torture.table import Row, Trials, markdown
 
@@ -33,6 +33,12 @@ def test_a_short_crowd(trials, monkeypatch):
     rows = crowd.crowd(trials)
     survived(rows)
     assert [row.tried for row in rows] == [10_000, 10_000, 400]
+
+
+def test_trials_from_outside(trials):
+    rows = outside.outside(trials)
+    survived(rows)
+    assert [row.tried for row in rows] == [2, 2, 2, 20, 2]
 
 
 def test_a_short_soak(trials, monkeypatch):

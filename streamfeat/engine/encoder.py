@@ -206,8 +206,10 @@ class Encoder(Shown):
         """SHA-256 over everything that decides what features are."""
         digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
         for name, value in zip(Operator._fields, self.operator, strict=True):
-            if name in ("shape", "wide", "upper", "lower", "gain") or (name == "steps" and value is None):
-                continue  # of the sensor, or of the narrow state alone
+            if name in ("shape", "packed", "wide", "upper", "lower", "gain"):
+                continue  # of the sensor, columns again, or of the narrow state alone
+            if name == "steps" and value is None:
+                continue  # of the narrow state, too
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
         for scale in self.further:
             digest.update(scale.fingerprint.encode())

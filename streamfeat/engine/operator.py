@@ -46,6 +46,7 @@ def fixed_fields(
         "unit": 1.0,
         "largest": math.inf,
         "threshold": float(np.float32(threshold)),
+        "packed": np.zeros((0, 0, 0), np.int16),
         "gram": (atoms @ atoms.T).astype(np.float32) if inverse else np.zeros((0, 0), np.float32),
     }
 
@@ -188,11 +189,23 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
         )
     columns = aligned_zeros(operator.columns.shape, np.int16)
     columns[:] = operator.columns
+    packed = operator.packed if form[0] else _in_pairs(columns)
+    checked = operator._replace(columns=columns, packed=packed)
     if operator.steps is not None:
-        return operator._replace(columns=columns)
-    checked = operator._replace(largest=_largest_code(operator), columns=columns)
+        return checked
+    checked = checked._replace(largest=_largest_code(checked))
     _fixed_point_bits(checked, 1)
     return checked
+
+
+def _in_pairs(columns: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Columns `(d, Kp)` as `Operator.packed` holds them; a column of zeros is added to an odd number."""
+    (d, width), pairs = columns.shape, -(-len(columns) // 2)
+    padded = np.zeros((2 * pairs, width), np.int16)
+    padded[:d] = columns
+    packed = aligned_zeros((width // LANES, pairs, 2 * LANES), np.int16)
+    packed.reshape(-1, pairs, LANES, 2)[:] = padded.reshape(pairs, 2, -1, LANES).transpose(2, 0, 3, 1)
+    return packed
 
 
 def _check_form(geometry: Geometry, operator: Operator) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import aligned_zeros
 from streamfeat.events import Resolution
+from streamfeat.kernels.dense import MOST_WAITING
 from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
@@ -57,6 +58,8 @@ def allocate_state(
     narrow = operator.steps is not None
     numbers, queue = (np.int16, QUEUE) if narrow else (np.int32, 0)
     features = 2 * padded if narrow or operator.kind == SPLIT else padded
+    waiting = MOST_WAITING if keep and operator.packed.size else 0
+    length = -(-geometry.entries // MASK_BITS) * MASK_BITS
     return State(
         counts=np.zeros(ring, np.int32),
         applied=np.zeros(ring, np.int16),
@@ -81,6 +84,7 @@ def allocate_state(
         lines=np.zeros((2, ring[2] + 1), np.int32),
         crowds=np.zeros((ring[1] + 1, columns), np.int32),
         dirty=np.zeros(planes * rows * columns, np.int32),
+        load=np.zeros(rows * columns + 1, np.int32),
         is_dirty=np.zeros(planes * volumes, np.uint8),
         code=aligned_zeros((threads, 2, padded), np.int32),
         sums=aligned_zeros((threads, queue + 1, padded), numbers),
@@ -88,7 +92,9 @@ def allocate_state(
         queued=np.zeros((threads, 4), np.int64),
         work=np.zeros((threads, 5, padded), np.float64),
         active=np.zeros((threads, padded), np.int64),
-        values=aligned_zeros((threads, 2, -(-geometry.entries // MASK_BITS) * MASK_BITS), np.int16),
+        values=aligned_zeros((threads, 2, length), np.int16),
+        windows=aligned_zeros((threads, waiting, length), np.int16),
+        awaiting=np.zeros((threads, waiting), np.int32),
         entries=np.zeros((threads, geometry.entries + 1), np.int32),
         changes=np.zeros((threads, geometry.entries + 1), np.int16),
         corners=np.zeros((threads, atoms * padded), np.float32),

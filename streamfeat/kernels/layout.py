@@ -68,6 +68,9 @@ class Operator(NamedTuple):
     """`(K, K)`: inner products of the atoms; empty unless `inverse`."""
     gap: float
     """The lasso stops at this duality gap, relative to `1/2 |x|^2`."""
+    packed: NDArray[np.int16]
+    """`(Kp / 32, ceil(d / 2), 64)`: for 32 filters and a pair of entries, both numbers of each filter;
+    `columns` again, as `dense` reads them. Empty where there is a quadratic form."""
     shape: tuple[int, int] = (0, 0)
     """Rows and columns of the grid of volumes; of the sensor, not of the model, which has none."""
     wide: bool | None = True
@@ -149,6 +152,9 @@ class State(NamedTuple):
     between the sides of each volume."""
     dirty: NDArray[np.int32]
     """`(planes * V,)`: volumes to work on, by `plane * V + volume`; a stack."""
+    load: NDArray[np.int32]
+    """`(V + 1,)`: scratch, work on the volumes that have to enter a plane: on those
+    before each on the dirty stack, in entries, and on all."""
     is_dirty: NDArray[np.uint8]
     """`(planes * V,)`: whether a volume is on that stack because entries of it changed."""
     code: NDArray[np.int32]
@@ -169,6 +175,11 @@ class State(NamedTuple):
     """`(N, K * Kp)`: scratch of the lasso, a part of the Gram matrix; in memory as far as used."""
     values: NDArray[np.int16]
     """`(N, 2, >= d)`: scratch, the entries of one volume and their changes; whole vectors of 64."""
+    windows: NDArray[np.int16]
+    """`(N, W, >= d)`: scratch, entries of the volumes that wait for the product (`dense`); `W` is zero where
+    rows are shared, or there is a form."""
+    awaiting: NDArray[np.int32]
+    """`(N, W)`: scratch, the volumes that wait for it."""
     entries: NDArray[np.int32]
     """`(N, d + 1)`: scratch, the entries of one volume that change; the last is room for half a pair."""
     changes: NDArray[np.int16]

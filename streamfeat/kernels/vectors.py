@@ -30,7 +30,15 @@ from streamfeat.kernels.assembly import (
 )
 from streamfeat.kernels.compiled import generated
 
-__all__ = ["copy_eight", "filled_mask", "lowest_bit", "prefetch", "sum_listed", "sum_products"]
+__all__ = [
+    "copy_eight",
+    "filled_mask",
+    "lowest_bit",
+    "multiply_tile",
+    "prefetch",
+    "sum_listed",
+    "sum_products",
+]
 
 EIGHT, MASK_BITS = 8, 64
 """Numbers that `copy_eight` copies, and that `filled_mask` looks at."""
@@ -118,6 +126,67 @@ def sum_listed(typing: Any, n: Any, entries: Any, changes: Any, columns: Any, su
         return context.get_dummy_value()
 
     return types.void(types.int64, entries, changes, columns, sums), generate
+
+
+TILE = 6
+"""Volumes that `multiply_tile` works on at once: their sums and a pair of columns fit into 32 registers."""
+
+
+@generated
+def multiply_tile(
+    typing: Any, n: Any, first: Any, windows: Any, rows: Any, packed: Any, filter: Any, projections: Any
+) -> Any:
+    """Projections of six volumes on 32 filters, from all of their entries.
+
+    `projections[rows[v], filter + k] = sum over i of windows[v, i] * columns[i, filter + k]` for `v` from
+    `first` on; beyond `n` it is the last volume again. `packed` holds the columns of these filters in pairs,
+    `(pairs, 64)`: of each filter both numbers side by side.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kinds = signature.args
+        windows, rows, packed, projections = (
+            context.make_array(kinds[i])(context, builder, arguments[i]) for i in (2, 3, 4, 6)
+        )
+        n, first, filters = arguments[0], arguments[1], arguments[5]
+        last, volumes = builder.sub(n, int64(1)), []
+        for i in range(TILE):
+            volume = builder.add(first, int64(i))
+            volumes.append(builder.select(builder.icmp_signed("<", volume, last), volume, last))
+        length = builder.extract_value(windows.shape, 1)
+        starts = [builder.mul(volume, length) for volume in volumes]
+        totals = _multiply(builder, builder.extract_value(packed.shape, 0), windows, starts, packed)
+        width = builder.extract_value(projections.shape, 1)
+        narrow = kinds[6].dtype == types.int16
+        for volume, sums in zip(volumes, totals, strict=True):
+            row = builder.zext(builder.load(builder.gep(rows.data, [volume])), I64)
+            at = builder.add(builder.mul(row, width), filters)
+            for half, total in enumerate(sums):
+                to = builder.add(at, int64(half * _HALF))
+                stored = builder.trunc(total, ir.VectorType(I16, _HALF)) if narrow else total
+                builder.store(stored, place(builder, projections, to, stored.type)).align = 2
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, windows, rows, packed, types.int64, projections), generate
+
+
+def _multiply(builder: Any, pairs: Any, windows: Any, starts: list[Any], packed: Any) -> list[list[Any]]:
+    """The loop over pairs of entries: two vectors of sums for each volume, in registers throughout."""
+    both, half = ir.VectorType(I16, BLOCK), ir.VectorType(I32, _HALF)
+
+    def add(index: Any, totals: list[Any]) -> list[Any]:
+        at, item = builder.mul(index, int64(2 * BLOCK)), builder.shl(index, int64(1))
+        columns = [load(builder, packed, builder.add(at, int64(i * BLOCK)), both) for i in range(2)]
+        following = []
+        for i, start in enumerate(starts):
+            factors = load(builder, windows, builder.add(start, item), ir.VectorType(I16, 2))
+            factors = builder.shuffle_vector(factors, factors, order([0, 1] * _HALF))
+            for total, column in zip(totals[2 * i : 2 * i + 2], columns, strict=True):
+                following.append(builder.add(total, product_of_pairs(builder, column, factors)))
+        return following
+
+    totals = repeat(builder, pairs, [ir.Constant(half, None)] * (2 * len(starts)), add)
+    return [totals[2 * i : 2 * i + 2] for i in range(len(starts))]
 
 
 _HALF = BLOCK // 2

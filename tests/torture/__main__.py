@@ -23,7 +23,9 @@ from torture.crowd import crowd  # noqa: E402
 from torture.damage import damaged_recordings  # noqa: E402
 from torture.faults import faults  # noqa: E402
 from torture.fuzz import hostile_bytes  # noqa: E402
+from torture.hours import hours  # noqa: E402
 from torture.kills import kills  # noqa: E402
+from torture.outside import outside  # noqa: E402
 from torture.soak import soak  # noqa: E402
 from torture.state import state  # noqa: E402
 from torture.table import Part, Row, Trials, markdown  # noqa: E402
@@ -35,6 +37,8 @@ PARTS: dict[str, tuple[Part, str]] = {
     "state": (state, "kill -9 of a listener that keeps its state"),
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
     "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
+    "outside": (outside, "pages of browsers, silent clients, claims of gigabytes, names that do things"),
+    "hours": (hours, "two hours of listen, record and view: cameras, disks, clocks and browsers"),
     "soak": (soak, "a day of stream time, 500 million events"),
 }
 

@@ -165,6 +165,8 @@ def _measure(options: argparse.Namespace) -> int:
             "recording": events.name,
             "seconds": round(seconds, 1),
             "stolen_share": round(share, 3),
+            "load": round(os.getloadavg()[0], 1),
+            "processor": results["machine"]["processor"],
         }
         options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         _say(f"{seconds:.0f} s, the host took {100 * share:.0f} % of a processor")

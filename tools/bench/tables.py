@@ -64,8 +64,17 @@ def _machine(results: dict[str, Any]) -> str:
         f"`{setting['recording']}` at K = {setting['n_filters']}, patch 12, {setting['n_bins']} bins. "
         "Contestants run in turns in one process; medians (10th to 90th percentile) of times, or of ratios "
         "inside a round; compilation and warm-up are not counted. `python tools/bench` measures it on "
-        "your machine; [`results.json`](results.json) has every figure."
+        "your machine; [`results.json`](results.json) has every figure." + _elsewhere(results)
     )
+
+
+def _elsewhere(results: dict[str, Any]) -> str:
+    """A sentence for each other machine that parts were measured on."""
+    here, others = results["machine"]["processor"], dict[str, list[str]]()
+    for name, run in results["runs"].items():
+        if run["processor"] != here:
+            others.setdefault(run["processor"], []).append(f"`{name}`")
+    return "".join(f" Measured on {place}: {', '.join(names)}." for place, names in others.items())
 
 
 def _targets(results: dict[str, Any]) -> str:

@@ -383,6 +383,28 @@ MUTANTS = [
         "tests/test_live_delivery.py",
     ),
     Mutant(
+        "the product's tile that is not full is left out",
+        "kernels/dense.py",
+        "whole = waiting if rest >= WORTH_A_TILE else waiting - rest",
+        "whole = waiting - rest",
+        "tests/test_kernels.py -k 'every_case and multiply'",
+        "columns are added instead: the same bits, and slower where four or five volumes are left",
+    ),
+    Mutant(
+        "volumes that wait keep entries of the bin after next",
+        "kernels/dense.py",
+        "        values[end:] = 0\n",
+        "",
+        "tests/test_kernels.py -k 'every_case and let_in'",
+    ),
+    Mutant(
+        "the last volumes that wait are never projected",
+        "kernels/planes.py",
+        "if waiting > 0 and (waiting == state.awaiting.shape[1] or i == last - 1):",
+        "if waiting > 0 and waiting == state.awaiting.shape[1]:",
+        "tests/test_invariants.py -k where_volumes_are_full",
+    ),
+    Mutant(
         "mono: polarity of the wrong bit",
         "kernels/decode.py",
         "pixel | (word >> np.uint64(63)) << np.uint64(32)",
