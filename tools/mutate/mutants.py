@@ -342,8 +342,8 @@ MUTANTS = [
     Mutant(
         "what a refused camera did is forgotten",
         "stream/cameras.py",
-        '            self._refuse(item.topic, "unusable", str(error))\n            self._past = _sum(',
-        '            self._refuse(item.topic, "unusable", str(error))\n            _sum(',
+        '            self._refuse(item.topic, _reason(error), str(error))\n            self._past = _sum(',
+        '            self._refuse(item.topic, _reason(error), str(error))\n            _sum(',
         "tests/test_cameras.py",
     ),
     Mutant(
@@ -486,8 +486,8 @@ MUTANTS = [
     Mutant(
         "half a file takes the place",
         "files/atomic.py",
-        "        yield temporary\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(target)\n    finally:\n",
-        "        yield temporary\n    finally:\n        temporary.chmod(0o666 & ~_umask())\n        temporary.replace(target)\n",
+        "        yield temporary\n        temporary.chmod(0o600 if private else 0o666 & ~_umask())\n        temporary.replace(target)\n    finally:\n",
+        "        yield temporary\n    finally:\n        temporary.chmod(0o600 if private else 0o666 & ~_umask())\n        temporary.replace(target)\n",
         "tests/test_atomic.py",
     ),
     Mutant(
