@@ -759,6 +759,8 @@ def make_count_events(rng):
         events["x"][near] = events["y"][near] = 0
         events["t"][near] = bin_start(engine)
         events["p"][near] = (np.arange(near.sum()) // 8 + rng.integers(0, 2)) % 2
+    if rng.random() < 0.2:
+        events["t"][rng.random(len(events)) < 0.05] = bin_start(engine, len(state.counts) + 5)
     return events, operator, state
 
 

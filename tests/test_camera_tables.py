@@ -415,7 +415,7 @@ class TestHdf5:
         cut_short = read_events(scenes.ecf_file(h5py, tmp_path / "a.h5", chunks))
         np.testing.assert_array_equal(cut_short.events, SCENE[:250])
         assert "after event 250 is lost: a chunk of ECF" in cut_short.damage[0]
-        with pytest.raises(InputError, match="damaged: a chunk of ECF"):
+        with pytest.raises(InputError, match="copy it anew: a chunk of ECF"):
             open_events(scenes.ecf_file(h5py, tmp_path / "b.h5", chunks[::-1]))
 
     def test_ecf_together_with_another_filter_is_refused(self, tmp_path, h5py):

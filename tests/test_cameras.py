@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import tiny
 
+from streamfeat.engine.geometry import Geometry
+from streamfeat.errors import InputError
 from streamfeat.messages.packets import Watermark
 from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import EmitPolicy
@@ -69,7 +71,15 @@ def test_more_cameras_than_there_is_room_for():
     assert cameras.topics == ["a", "c", "d"]
 
 
-def test_a_packet_that_cannot_be_used_costs_its_camera_no_more_than_its_window():
+def test_a_packet_that_cannot_be_used_costs_its_camera_no_more_than_its_window(monkeypatch):
+    grid_shape = Geometry.grid_shape
+
+    def refusing(self, resolution):
+        if resolution == (2, 2):
+            raise InputError("so many volumes that sums could overflow")
+        return grid_shape(self, resolution)
+
+    monkeypatch.setattr(Geometry, "grid_shape", refusing)
     cameras = Cameras(make_session)
     good = replace(tiny.packet(tiny.steady(0, 5_000, 50)), topic="a")
     bad = replace(tiny.packet(tiny.stream([6_000], resolution=(2, 2)), (2, 2)), topic="a")

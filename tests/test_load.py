@@ -127,10 +127,10 @@ def test_the_grid_that_suits_a_sensor(monkeypatch, resolution, rate, grid):
         assert replace(found, stride=2, downsample=1) == setting
 
 
-def test_a_sensor_that_no_grid_follows_gets_the_coarsest_and_one_too_small_costs_nothing(monkeypatch):
+def test_a_sensor_that_no_grid_follows_gets_the_coarsest_and_a_small_one_costs_little(monkeypatch):
     monkeypatch.setattr("streamfeat.learn.sensor.followed", lambda recording: ((30_000, 30_000), 1e9))
     assert suited_to([None], Setting()).downsample == 8
-    assert load_of(Setting(), (8, 8), 1e6) == 0.0
+    assert load_of(Setting(), (8, 8), 1e6) < 1e-3
 
 
 def test_the_rate_is_that_of_the_first_second(tmp_path):

@@ -22,6 +22,7 @@ from streamfeat.messages.cdr import EventArray, EventPacket, FeaturesMessage, La
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, make_decoder
 from streamfeat.messages.packets import PacketWriter
 from streamfeat.recordings import records as mcap_records
+from streamfeat.recordings import unpacking
 from streamfeat.recordings.options import ReadOptions
 from streamfeat.recordings.reader import WHOLE, Label, Packet, Topic, open_recording
 from streamfeat.recordings.samples import complete_samples
@@ -544,7 +545,7 @@ def test_claims_beyond_the_limit(tmp_path, monkeypatch):
     path = write_messages(
         tmp_path / "a.mcap", packet(), packet(payload=bytes(80_000), seq=1), packet(seq=2), chunk_size=1
     )
-    monkeypatch.setattr(mcap_records, "MAX_RECORD_BYTES", 50_000)
+    monkeypatch.setattr(unpacking, "MAX_RECORD_BYTES", 50_000)
     events, losses = read(path)
     assert len(events) == 2
     assert "the limit is 50000" in losses.first["damaged chunk"]

@@ -42,7 +42,7 @@ ROWS = {
         f"{THIS_PROCESS}::test_events_that_change_nothing"
     ],
     "events are older than the window": [f"{THIS_PROCESS}::test_events_that_change_nothing"],
-    "files of a data set cannot be read": [
+    "files of a data set, images or frames cannot be read": [
         "test_datasets.py::test_bad_samples_are_reported_and_the_others_converted"
     ],
     "a store refuses, or goes away midway": [
@@ -83,7 +83,7 @@ ROWS = {
         "test_evaluate.py::test_an_interrupted_run_goes_on",
         f"{THIS_PROCESS}::test_sigterm_ends_a_command_as_ctrl_c_does",
     ],
-    "Ctrl-C or SIGTERM, `convert` and `train`": [
+    "Ctrl-C or SIGTERM, `convert`, `simulate` and `train`": [
         f"{THIS_PROCESS}::test_sigterm_ends_a_command_as_ctrl_c_does"
     ],
     "`kill -9`, `record`": ["test_live_cli.py::test_record_survives_a_kill_with_all_but_the_last_chunk"],

@@ -130,9 +130,7 @@ def learn(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
             )
     except KeyboardInterrupt:
-        err.print(
-            "[yellow]interrupted[/] before an iteration was done, or all scales were; nothing was written"
-        )
+        err.print("[yellow]interrupted[/] before an iteration was done; nothing was written", soft_wrap=True)
         raise typer.Exit(130) from None
     encoder.save(model)
     part.unlink(missing_ok=True)

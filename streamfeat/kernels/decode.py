@@ -231,8 +231,8 @@ def time_span(events: Events, height: int, width: int, span: NDArray[np.int64]) 
     n = 0
     first, last = LATEST, EARLIEST
     for i in range(len(events)):
-        if events[i].x < width and events[i].y < height:
-            first, last = min(first, events[i].t), max(last, events[i].t)
+        if events["x"][i] < width and events["y"][i] < height:
+            first, last = min(first, events["t"][i]), max(last, events["t"][i])
             n += 1
     if n:
         span[0], span[1] = first, last

@@ -55,7 +55,8 @@ def follow_event(
     if position != UNCHANGED:
         change_place(position, row, column, operator, state)
     if state.cursors.shape[0] > 1:
-        share = min(max((t - state.clock[CLOCK_START]) / operator.bin_us, 0.0), 1.0)
+        start, length = state.clock[CLOCK_START], operator.bin_us
+        share = (min(max(t, start), start + length) - start) / length  # any t: a difference could overflow
         projected = min(n_volumes, int(n_volumes * share / PROJECTED_BY))
         coded = min(n_volumes, int(n_volumes * max(share - CODED_FROM, 0.0) / (CODED_BY - CODED_FROM)))
         coming = state.cursors[1 - state.clock[CLOCK_PLANE]]

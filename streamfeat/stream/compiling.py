@@ -30,6 +30,7 @@ from streamfeat.errors import InputError
 from streamfeat.events import make_events
 from streamfeat.files.outputs import locked_file
 from streamfeat.kernels import cache
+from streamfeat.kernels.decode import place_events
 from streamfeat.kernels.ingest import count_events
 from streamfeat.kernels.planes import look_ahead
 from streamfeat.kernels.update import mark_dirty, read, renew, settle
@@ -175,6 +176,7 @@ def _compile(half: str, *, narrow: bool, told: Callable[[], object] = lambda: No
         look_ahead(0, 0, 0, operator, state)
         return
     count_events(event, operator, state)
+    place_events(event, *resolution, 0, np.empty(1, np.int64), np.empty(2, np.int64))
     mark_dirty(operator, state)
     renew(_FIRST, _ALONE, operator, state)
     settle(state)

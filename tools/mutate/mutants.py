@@ -342,8 +342,8 @@ MUTANTS = [
     Mutant(
         "what a refused camera did is forgotten",
         "stream/cameras.py",
-        '            self._refuse(item.topic, _reason(error), str(error))\n            self._past = _sum(',
-        '            self._refuse(item.topic, _reason(error), str(error))\n            _sum(',
+        "            self._refuse(item.topic, _reason(error), str(error))\n            self._past = _sum(",
+        "            self._refuse(item.topic, _reason(error), str(error))\n            _sum(",
         "tests/test_cameras.py",
     ),
     Mutant(
