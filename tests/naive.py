@@ -1022,8 +1022,8 @@ def follow_event(x, y, p, t, operator, state):
         change_place(position, row, column, operator, state)
     if len(state.cursors) == 2:
         share = float(np.clip((t - int(state.clock[CLOCK_START])) / operator.bin_us, 0, 1))
-        goals = np.array([share / 0.9, max(share - 0.85, 0.0) / (0.975 - 0.85)])
-        coded, projected = (int(goal) for goal in np.minimum(n_volumes, n_volumes * goals)[::-1])
+        projected = min(n_volumes, int(n_volumes * share / 0.9))
+        coded = min(n_volumes, int(n_volumes * max(share - 0.85, 0.0) / (0.975 - 0.85)))
         coming = state.cursors[1 - int(state.clock[CLOCK_PLANE])]
         behind = max(projected - coming[CURSOR_PROJECTED], coded - coming[CURSOR_CODED], 0)
         budget = 24 + 100 * int(behind) // n_volumes

@@ -297,8 +297,7 @@ async def cancelled_after(turns, start):
     return True
 
 
-@pytest.mark.parametrize("way", ["for", "with"])
-@pytest.mark.parametrize("idle", [False, True])
+@pytest.mark.parametrize(("way", "idle"), [("for", True), ("with", False)])
 def test_a_stream_cancelled_at_any_await_leaves_nothing(way, idle):
     jobs = []
 
