@@ -1,4 +1,4 @@
-"""Several scales in one engine: the invariants, the file, snapshots, sensors without room, commands."""
+"""Several scales in one engine: the invariants, the file, snapshots, small sensors, commands."""
 
 import asyncio
 import json
@@ -105,12 +105,7 @@ def test_features_are_those_of_each_scale_however_it_is_fed_and_read(kind, data)
     where = {"origin_us": origin_us, "t_us": end}
     offline = case.encoder.encode(events, case.resolution, **where)
     # By encoders of one scale, which know nothing of others.
-    apart = [
-        one.encode(events, case.resolution, **where)
-        if one.geometry.has_room(case.resolution)
-        else np.zeros(one.n_features, np.float32)
-        for one in case.encoder.scales
-    ]
+    apart = [one.encode(events, case.resolution, **where) for one in case.encoder.scales]
     np.testing.assert_array_equal(offline, np.concatenate(apart), strict=True)
     alone = Engine(case.encoder.scales[0], case.resolution, origin_us=origin_us)
     alone.feed(events)
@@ -129,19 +124,13 @@ def test_an_inverse_scale_has_the_bits_that_it_has_alone(kind, data):
     case = data.draw(scaled_cases(("direct", "split"), (kind,)))
     events = data.draw(streams(case))
     engine = case.engine()
-    alone = [
-        Engine(one, case.resolution, threads=case.threads) if one.geometry.has_room(case.resolution) else None
-        for one in case.encoder.scales
-    ]
+    alone = [Engine(one, case.resolution, threads=case.threads) for one in case.encoder.scales]
     for batch in np.array_split(events, 3):
         engine.feed(batch)
         features = engine.features()
         for place, one in zip(case.encoder.places, alone, strict=True):
-            if one is None:
-                assert not features[place].any()
-            else:
-                one.feed(batch)
-                np.testing.assert_array_equal(features[place], one.features())
+            one.feed(batch)
+            np.testing.assert_array_equal(features[place], one.features())
 
 
 @settings(max_examples=EXAMPLES)
@@ -250,25 +239,14 @@ def test_a_snapshot_of_other_scales_is_refused_and_changes_nothing():
     assert engine.features().tobytes() == before.tobytes()
 
 
-def test_a_sensor_without_room_for_a_scale_has_zeros_there():
-    events = tiny.stream(range(0, 3000, 50), resolution=(5, 16))
-    engine = Engine(BOTH, (5, 16))  # three rows of ring pixels at half the resolution would be six
+@pytest.mark.parametrize("resolution", [(5, 16), (3, 16), (1, 1)])
+def test_a_sensor_smaller_than_a_volume_has_features_of_every_scale(resolution):
+    events = tiny.stream(range(0, 3000, 50), resolution=resolution)
+    engine = Engine(BOTH, resolution)
     engine.feed(events)
     features = engine.features()
-    first, second = BOTH.places
-    assert features[first].any()
-    assert Engine(BOTH, (6, 16))._further
-    big = Engine(BOTH, (12, 16))
-    big.feed(events)
-    assert big.features()[second].any() == bool(Engine(BOTH, (12, 16))._further)
-    narrow = Engine(BOTH, (4, 16))
-    narrow.feed(events)
-    assert not narrow.features()[second].any()
-    # Too small for a volume of the first scale, which has pixels that never fire then.
-    smaller = Engine(BOTH, (3, 16))
-    smaller.feed(events[events["y"] < 3])
-    assert smaller.features().any()
-    assert not smaller.features()[second].any()
+    np.testing.assert_array_equal(features, BOTH.encode(events, resolution, origin_us=0))
+    assert all(features[place].any() for place in BOTH.places)
 
 
 # The encoder and its file

@@ -97,9 +97,6 @@ class Encoder(Shown):
     def side_by_side(cls, scales: "Sequence[Encoder]") -> "Encoder":
         """One encoder of several scales, with the features of each, one behind the other.
 
-        A sensor must have room for the first scale; where it has none for a further one, the features of that
-        scale are zero.
-
         Example:
             >>> both = Encoder.side_by_side([fine, coarse])
             >>> both.n_features == fine.n_features + coarse.n_features
@@ -257,13 +254,12 @@ class Encoder(Shown):
             InputError: `events` are no events.
         """
         events = as_events(events)
-        features = np.zeros(self.n_features, np.float32)
-        for number, (place, one) in enumerate(zip(self.places, (self, *self.further), strict=True)):
-            if number == 0 or one.geometry.has_room(resolution):
-                features[place] = encode_window(
-                    one.geometry, one.operator, events, resolution, origin_us, t_us
-                )
-        return features
+        return np.concatenate(
+            [
+                encode_window(one.geometry, one.operator, events, resolution, origin_us, t_us)
+                for one in (self, *self.further)
+            ]
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file; the file appears whole or not at all."""

@@ -110,7 +110,6 @@ class Engine(Shown):
         self._further = [
             (place, Engine(scale, resolution, origin_us=origin_us, look_ahead=look_ahead, threads=threads))
             for place, scale in zip(encoder.places[1:], encoder.further, strict=True)
-            if scale.geometry.has_room(resolution)
         ]
 
     @one_thread

@@ -29,7 +29,7 @@ class Snapshot:
         origin_us: stream time at which bin 0 starts.
         tally: `(5,)` int64, what was counted.
         encoded: `(2,)` int64, their sum is how many volumes were encoded.
-        further: of the further scales that the sensor has room for.
+        further: of the further scales.
     """
 
     fingerprint: str

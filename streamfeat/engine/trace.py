@@ -86,12 +86,12 @@ def joined(
     Args:
         first: of the first scale, whose features stand in front.
         further: where the features of each other scale stand, and its trace.
-        n_features: of all scales; features of a scale without room on the sensor are zero.
+        n_features: of all scales.
         weights: of a linear classifier for all features; None for no scores.
         keep_features: whether features are wanted.
     """
     n = len(first.accepted)
-    features = np.zeros((n, n_features), np.float32)
+    features = np.empty((n, n_features), np.float32)
     features[:, : first.features.shape[1]] = first.features
     for place, one in further:
         features[:, place] = one.features

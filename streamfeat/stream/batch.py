@@ -7,6 +7,7 @@ Not here: one emission (`emission`), making batches (`session`), where they go (
 Under `--emit event` an object for each emission would cost as much as all of its arithmetic.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
@@ -113,16 +114,16 @@ _COLUMNS = "t_us", "n_events", "features", "scores", "incomplete"
 _OF_ALL_ROWS = "labels", "sample", "final", "topic", "source_ns", "active_volumes"
 
 
-class Emitter:
+class Emitter(ABC):
     """Makes emissions of items: in batches, as a pipeline takes them, or one at a time."""
 
+    @abstractmethod
     def batches(self, item: Any, /) -> Iterator[EmissionBatch]:
         """Take in one item of the stream, and yield the emissions on the way in columns."""
-        raise NotImplementedError
 
+    @abstractmethod
     def last_batches(self) -> Iterator[EmissionBatch]:
         """End the stream, and yield the emissions that are left in columns."""
-        raise NotImplementedError
 
     def process(self, item: Any, /) -> Iterator[Emission]:
         """Take in one item of the stream, and yield the emissions on the way."""
