@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from streamfeat.classify import kernel as kernel_module
+from streamfeat.classify import machine as machine_module
 from streamfeat.classify.calibration import calibration_error, confidence_bins, error_of_bins
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.kernel import train_kernel_classifier
@@ -197,7 +197,7 @@ def test_a_kernel_larger_than_memory_is_refused_in_one_line(monkeypatch):
     def no_room(*arguments):
         raise MemoryError
 
-    monkeypatch.setattr(kernel_module, "_distances", no_room)
+    monkeypatch.setattr(machine_module, "_distances", no_room)
     with pytest.raises(
         InputError, match="not enough memory for --kernel rbf with 30 training rows"
     ) as caught:
@@ -209,11 +209,11 @@ def test_principal_axes_by_iteration_hold_what_the_exact_ones_hold(monkeypatch):
     rng = np.random.default_rng(5)
     rows = (rng.standard_normal((300, 290)) * np.arange(1, 291) ** -1.0).astype(np.float32)
     rows -= rows.mean(axis=0)
-    monkeypatch.setattr(kernel_module, "_DIMENSIONS", 20)
-    exact = kernel_module._principal_axes(rows)
-    monkeypatch.setattr(kernel_module, "_EXACT_AXES", 100)
-    near = kernel_module._principal_axes(rows)
+    monkeypatch.setattr(machine_module, "_DIMENSIONS", 20)
+    exact = machine_module._principal_axes(rows)
+    monkeypatch.setattr(machine_module, "_EXACT_AXES", 100)
+    near = machine_module._principal_axes(rows)
     assert near.shape == exact.shape == (290, 20)
     np.testing.assert_allclose(near.T @ near, np.eye(20), atol=1e-5)
     assert np.square(rows @ near).sum() > 0.999 * np.square(rows @ exact).sum()
-    assert kernel_module._principal_axes(rows).tobytes() == near.tobytes()
+    assert machine_module._principal_axes(rows).tobytes() == near.tobytes()

@@ -218,7 +218,7 @@ def test_what_a_method_does_not_use_makes_no_other_cell():
     assert direct.setting == Trial(**base)
     assert inverse.setting == Trial(formulation="inverse", iterations=3, coherence=0.3, patch=5)
     assert kmeans.setting == Trial(patch=5)
-    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "linear", "test_mirror": False}
+    training = {"mirror": False, "cuts": "", "shift": 0, "kernel": "auto", "test_mirror": False}
     assert counts.key == {"method": "counts", "setting": training, "fold": 0}
 
 
@@ -254,7 +254,7 @@ def test_any_value_of_a_setting_can_be_swept(text, values):
         (["--sweep", "encoding=soft,"], "give names, such as --sweep encoding=soft,split"),
         (["--sweep", "mirror=maybe"], "give yes and no, such as --sweep mirror=yes,no"),
         (["--on", "test"], "--on test is unknown; choose held-out or train"),
-        (["--kernel", "cubic"], "kernel is 'cubic', it must be linear or rbf"),
+        (["--kernel", "cubic"], "kernel is 'cubic', it must be one of auto, linear, rbf"),
         (["--groups", "video"], "--groups video is unknown; choose from block, source, none"),
         (["--sweep", "encoding=loud"], "encoding is 'loud'"),
         (["--method", "counts", "--sweep", "bins=2"], "--sweep bins: none of counts uses it"),

@@ -14,8 +14,12 @@ from typer.testing import CliRunner
 
 from streamfeat import cli
 from streamfeat.classify import kernel as kernel_module
+from streamfeat.classify import machine as machine_module
 from streamfeat.classify.classifier import Classifier, normalise_features, train_classifier
 from streamfeat.classify.kernel import KernelClassifier, load_classifier, train_kernel_classifier
+from streamfeat.classify.machine import cells_of, normalise_cells
+from streamfeat.classify.training import train
+from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.session import Session
@@ -55,9 +59,10 @@ def test_it_is_kernel_ridge_regression():
     features, labels = rings(150)
     clf, fresh = trained(150), rings(20, seed=2)[0]
     targets = np.where(labels[:, None] == np.array(clf.labels), 1.0, -1.0)
-    places = (normalise_features(features) - clf.mean) @ clf.axes
-    ridge = KernelRidge(alpha=1e-2, kernel="rbf", gamma=clf.gamma).fit(places, targets)
-    expected = ridge.predict((normalise_features(fresh) - clf.mean) @ clf.axes)
+    (machine,) = clf.machines
+    places = (normalise_features(features) - machine.mean) @ machine.axes
+    ridge = KernelRidge(alpha=1e-2, kernel="rbf", gamma=machine.gamma).fit(places, targets)
+    expected = ridge.predict((normalise_features(fresh) - machine.mean) @ machine.axes)
     np.testing.assert_allclose(clf.scores(fresh), expected, atol=2e-3)
     # Not more axes than features: distances are those of the normalised features.
     rows = normalise_features(features)
@@ -153,20 +158,121 @@ def test_train_and_replay_with_a_kernel(tmp_path):
     )
     assert replayed.exit_code == 0, replayed.output
     wrong = CliRunner().invoke(cli.app, ["train", *common, "-o", str(tmp_path / "no"), "--kernel", "cubic"])
-    assert "--kernel cubic is unknown" in str(wrong.exception)
+    assert "kernel is 'cubic', it must be one of auto, linear, rbf" in str(wrong.exception)
 
 
 def test_one_emission_at_fifteen_thousand_samples_is_quick():
     clf, rng = trained(60), np.random.default_rng(0)
-    wide = dataclasses.replace(
-        clf,
+    machine = dataclasses.replace(
+        clf.machines[0],
         axes=rng.standard_normal((N, 256)).astype(np.float32),
         points=rng.standard_normal((15_000, 256)).astype(np.float32),
         dual=rng.standard_normal((15_000, 2)).astype(np.float32),
     )
+    wide = dataclasses.replace(clf, machines=(machine,))
     row, taken = rings(1)[0][0], []
     for _ in range(30):
         started = time.perf_counter()
         wide.scores(row)
         taken.append(time.perf_counter() - started)
     assert min(taken) < 0.02  # a bound for any machine; figures are in the README of this room
+
+
+def scales(n=120, seed=0):
+    """Features of two scales of four cells, of which one feature each tells the class; and their labels."""
+    rng = np.random.default_rng(seed)
+    features = rng.random((n, 40)).astype(np.float32)
+    second = rng.random(n) < 0.5
+    features[:, [3, 33]] += 0.7 * second[:, None]
+    return features, np.where(second, "b", "a")
+
+
+CELLS = ((6,) * 4, (4,) * 4)
+
+
+def committee(n=120):
+    features, labels = scales(n)
+    linear = Classifier.untrained(labels.tolist(), Columns(40))
+    return train_kernel_classifier(features, linear, labels, np.arange(n) % 3, CELLS)
+
+
+@dataclasses.dataclass
+class Columns:
+    """What features are for a classifier: so many of them."""
+
+    n_features: int
+    fingerprint: str = "of nothing"
+
+
+def test_cells_have_the_same_length_and_empty_ones_stay_empty():
+    rows = np.array([[4, 0, 1, 1, 0, 0], [0, 0, 9, 0, 0, 16]], np.float32)
+    half, third = np.float32(np.sqrt(1 / 2)), np.float32(np.sqrt(1 / 2) / np.sqrt(2))
+    expected = np.array([[half, 0, third, third, 0, 0], [0, 0, half, 0, 0, half]])
+    np.testing.assert_allclose(normalise_cells(rows, (2, 2, 2)), expected, rtol=1e-6)
+    assert np.array_equal(normalise_cells(rows, (6,)), normalise_features(rows))
+    assert not normalise_cells(np.zeros(6, np.float32), (2, 2, 2)).any()
+
+
+def test_every_scale_has_a_machine_and_their_scores_are_averaged():
+    clf, (fresh, _) = committee(), scales(20, seed=1)
+    features, labels = scales()
+    alone = [
+        train_kernel_classifier(
+            features[:, place], Classifier.untrained(["a", "b"], Columns(n)), labels, None, [cells]
+        )
+        for place, n, cells in ((slice(0, 24), 24, CELLS[0]), (slice(24, 40), 16, CELLS[1]))
+    ]
+    expected = (alone[0].scores(fresh[:, :24]) + alone[1].scores(fresh[:, 24:])) / 2
+    np.testing.assert_array_equal(clf.scores(fresh), expected)
+    assert np.array_equal(clf.scores(fresh[7]), clf.scores(fresh)[7])
+    two = tiny.encoder()
+    assert cells_of(Encoder.side_by_side([two, two])) == cells_of(two) * 2
+    assert cells_of(two) == ((two.n_features // 4,) * 4,)
+    assert cells_of(Columns(9)) == ((9,),)
+
+
+def test_a_committee_is_saved_and_an_unsound_one_is_refused(tmp_path):
+    clf, (fresh, _) = committee(), scales(5, seed=2)
+    clf.save(tmp_path / "good")
+    assert np.array_equal(load_classifier(tmp_path / "good").emitted(fresh), clf.emitted(fresh))
+    with safe_open(tmp_path / "good", framework="numpy") as file:
+        meta = json.loads(file.metadata()["streamfeat"])
+    machines = meta["machines"]
+    for wrong in (None, [], 7, machines[:1], [{**machines[0], "cells": [30, -6]}, machines[1]], [{}, {}]):
+        save_file(
+            load_file(tmp_path / "good"),
+            tmp_path / "bad",
+            metadata={"streamfeat": json.dumps(meta | {"machines": wrong})},
+        )
+        with pytest.raises(InputError, match=r"the cells of its machines are not those of 40 features"):
+            load_classifier(tmp_path / "bad")
+
+
+def test_the_better_classifier_is_taken(monkeypatch):
+    features, labels = rings(150)
+    parts = np.arange(150) % 3
+    assert isinstance(train("auto", features, labels.tolist(), MODEL, parts), KernelClassifier)
+    assert isinstance(train("linear", features, labels.tolist(), MODEL, parts), Classifier)
+    alone = train("rbf", features, labels.tolist(), MODEL, parts, alone=True)
+    assert isinstance(alone, KernelClassifier)
+    assert not alone.linear.weights.any()
+    monkeypatch.setattr("streamfeat.classify.training.MOST_POINTS", 149)
+    assert isinstance(train("auto", features, labels.tolist(), MODEL, parts), Classifier)
+    monkeypatch.undo()
+    monkeypatch.setattr("streamfeat.classify.kernel.MOST_POINTS", 149)  # as if there were no memory for it
+    assert isinstance(train("auto", features, labels.tolist(), MODEL, parts), Classifier)
+    monkeypatch.undo()
+    # Where a linear classifier is right for all, it is kept: it is the quicker one.
+    features[:, 0] = np.where(labels == "in", 50, 0)
+    assert isinstance(train("auto", features, labels.tolist(), MODEL, parts), Classifier)
+
+
+def test_a_matrix_that_float32_cannot_factor_is_factored_in_float64(monkeypatch):
+    rng = np.random.default_rng(0)
+    points = np.repeat(rng.standard_normal((20, 3)), 20, axis=0).astype(np.float32)
+    targets = np.where(points[:, :1] > 0, np.float32(1), np.float32(-1))
+    monkeypatch.setattr(machine_module, "_RIDGE_WEIGHT", 1e-9)  # lost beside one in float32
+    kernel = np.exp(-((points[:, None].astype(float) - points) ** 2).sum(axis=2))
+    dual = machine_module._dual(points, targets, 1.0)
+    assert np.isfinite(dual).all()
+    assert np.array_equal(np.sign(kernel @ dual), targets)

@@ -101,7 +101,7 @@ def evaluate(
     mirror: options.Mirror = False,
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
-    kernel: options.Kernel = "linear",
+    kernel: options.Kernel = "auto",
     select: Annotated[
         int,
         typer.Option(help="Learn so many times as many filters, and let labels choose those that are kept."),

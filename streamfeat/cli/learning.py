@@ -39,8 +39,6 @@ from streamfeat.cli.reading import print_assumptions, print_removed, reads_recor
 from streamfeat.errors import InputError
 
 if TYPE_CHECKING:
-    from streamfeat.classify.classifier import Classifier
-    from streamfeat.classify.kernel import KernelClassifier
     from streamfeat.engine.encoder import Encoder
     from streamfeat.learn.fit import Keep
     from streamfeat.learn.settings import Setting
@@ -216,7 +214,7 @@ def train(
     mirror: options.Mirror = False,
     cuts: options.Cuts = "",
     shift: options.Shift = 0,
-    kernel: options.Kernel = "linear",
+    kernel: options.Kernel = "auto",
     select: Annotated[
         int | None,
         typer.Option(
@@ -244,8 +242,10 @@ def train(
     from streamfeat.classify.classifier import train_classifier
     from streamfeat.classify.features import encode_recordings, training_set
     from streamfeat.classify.folds import assign_folds, groups_named
-    from streamfeat.classify.kernel import train_kernel_classifier
+    from streamfeat.classify.kernel import KERNEL_SHARE, KernelClassifier
     from streamfeat.classify.selection import with_best_filters
+    from streamfeat.classify.training import check_kernel
+    from streamfeat.classify.training import train as train_best
     from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
@@ -259,8 +259,7 @@ def train(
         refuse_existing(selected_model, *recordings, model, classifier, overwrite=overwrite)
     kind = groups_named(groups)
     variants = variants_of(mirror=mirror, cuts=parse_cuts(cuts), shift=shift)
-    if kernel not in ("linear", "rbf"):
-        raise InputError(f"--kernel {kernel} is unknown; choose linear or rbf")
+    check_kernel(kernel)
     encoder = Encoder.load(model_or_general(model))
     with contextlib.ExitStack() as files:
         opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
@@ -291,10 +290,7 @@ def train(
         sources = samples.sources[~samples.held_out].tolist()
         parts = assign_folds(labels[: len(sources)], sources, folds, kind)
         made_from = {"variants": [str(v) for v in variants], "groups": kind}
-        trained = train_classifier(rows, labels, encoder, parts=parts[numbers], provenance=made_from)
-    found: Classifier | KernelClassifier = trained
-    if kernel == "rbf":
-        found = train_kernel_classifier(rows, trained, np.asarray(labels), parts[numbers])
+        found = train_best(kernel, rows, labels, encoder, parts[numbers], provenance=made_from)
     found.save(classifier)
     if selected_model:
         encoder.save(selected_model)
@@ -302,11 +298,13 @@ def train(
     result: dict[str, Any] = {
         "written": str(classifier),
         "selected_model": str(selected_model) if selected_model else None,
-        "labels": list(trained.labels),
-        "kernel": kernel,
+        "labels": list(found.labels),
+        "kernel": "rbf" if isinstance(found, KernelClassifier) else "linear",
         "samples": len(samples.rows) - len(held_out),
-        "C": trained.provenance["C"],
-        "cross_validation": max(trained.provenance["cross_validation"].values()),
+        "C": found.provenance["C"],
+        "cross_validation": found.provenance[KERNEL_SHARE]
+        if isinstance(found, KernelClassifier)
+        else max(found.provenance["cross_validation"].values()),
     }
     if len(held_out):
         likely, true = found.emitted(held_out), samples.labels[samples.held_out]

@@ -171,9 +171,10 @@ Shift = Annotated[
 Kernel = Annotated[
     str,
     typer.Option(
-        help="Of the classifier: linear, or rbf, which is more accurate and takes about a millisecond for an "
-        "emission; --emit event and --learn-online use the linear one beside it.",
-        autocompletion=completing("linear", "rbf"),
+        help="Of the classifier: linear; rbf, which is more accurate and takes about a millisecond for an "
+        "emission (--emit event and --learn-online use the linear one beside it); or auto, rbf where samples "
+        "are few enough and folds of them say that it is better.",
+        autocompletion=completing("auto", "linear", "rbf"),
     ),
 ]
 

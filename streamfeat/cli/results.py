@@ -177,7 +177,7 @@ RESULTS: dict[str, dict[str, Field]] = {
             "text?", "with --select: the model of the filters that were kept", quiet=True
         ),
         "labels": Field("[text]", "names of the classes"),
-        "kernel": Field("text", "`linear` or `rbf`"),
+        "kernel": Field("text", "of the classifier that was written, `linear` or `rbf`"),
         "samples": Field("int", "samples that were trained on"),
         "C": Field("number", "regularisation that cross-validation chose"),
         "cross_validation": Field("number", "accuracy over its folds", "accuracy over folds"),

@@ -15,8 +15,9 @@ from streamfeat.classify.calibration import confidence_bins
 from streamfeat.classify.classifier import Classifier, train_classifier
 from streamfeat.classify.features import EncodedSamples, encode_recordings, training_set
 from streamfeat.classify.folds import assign_folds
-from streamfeat.classify.kernel import KernelClassifier, train_kernel_classifier
+from streamfeat.classify.kernel import KernelClassifier
 from streamfeat.classify.selection import with_best_filters
+from streamfeat.classify.training import train
 from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.methods import Report, make_features
@@ -161,12 +162,7 @@ def _scored(
     rows, labels, numbers = training_set(samples, others)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
-    classifier: Classifier | KernelClassifier
-    if cell.setting.kernel == "rbf":  # the linear one beside it is not scored, so it is not trained
-        beside = Classifier.untrained(labels, features)
-        classifier = train_kernel_classifier(rows, beside, np.asarray(labels), parts[numbers])
-    else:
-        classifier = train_classifier(rows, labels, features, parts=parts[numbers])
+    classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True)
     trained = time.perf_counter()
     report("training", 1, 1, "")
     mirrored = images.rows[samples.held_out] if images and cell.setting.test_mirror else None
@@ -181,6 +177,7 @@ def _scored(
         "confusion": confusion(true, predicted, data.names),
         "features": features.n_features,
         "C": classifier.provenance.get("C"),
+        "kernel": "rbf" if isinstance(classifier, KernelClassifier) else "linear",
         "train_s": round(trained - started, 3),
     }
 

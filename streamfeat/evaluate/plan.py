@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from streamfeat.classify.training import check_kernel
 from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.learn.settings import Setting
@@ -73,7 +74,7 @@ class Trial(Setting):
         mirror: train on mirror images of the training samples as well.
         cuts: milliseconds after which samples are cut to be trained on as well, such as `33+67`.
         shift: pixels by which samples are moved to each side to be trained on as well.
-        kernel: `linear`, or `rbf`.
+        kernel: `linear`, `rbf`, or `auto` for the one that folds of the training samples say is better.
         test_mirror: add the scores of the mirror image of a sample that is scored.
         select: so many times as many filters are learned, of which the labels of training samples choose.
     """
@@ -82,14 +83,13 @@ class Trial(Setting):
     mirror: bool = False
     cuts: str = ""
     shift: int = 0
-    kernel: str = "linear"
+    kernel: str = "auto"
     test_mirror: bool = False
     select: int = 1
 
     def __post_init__(self) -> None:
         """Check the kernel, and all that `Setting` checks."""
-        if self.kernel not in ("linear", "rbf"):
-            raise InputError(f"kernel is {self.kernel!r}, it must be linear or rbf")
+        check_kernel(self.kernel)
         if not 1 <= self.select <= _MOST_TIMES:
             raise InputError(f"select is {self.select}, it must be from 1 to {_MOST_TIMES}")
         if self.select > 1 and self.scales != "none":

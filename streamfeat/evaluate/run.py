@@ -296,6 +296,7 @@ def _row(cell: Cell, folds: Sequence[dict[str, Any]], units: NDArray[np.int64]) 
         "samples": folds[0]["samples"],
         "features": folds[0]["features"],
         "C": [fold["C"] for fold in folds],
+        "kernel": [fold["kernel"] for fold in folds],
         **{
             name: round(float(np.mean([fold[name] for fold in folds])), 3)
             for name in ("learn_s", "encode_s", "train_s")

@@ -203,10 +203,16 @@ def notes(result: dict[str, Any]) -> list[str]:
     lines = [
         f"{', '.join(result['recordings'])}: {samples['training']:,} samples to learn from, "
         f"{samples['held_out']:,} held out; split: {result['split']}; {result['interval']}.",
-        "Every method's features go through the same normalisation and classifier, a linear SVM or, with "
-        "kernel rbf, Gaussian kernel ridge. Encoding is of all "
-        "samples, training with the choice of C; the peak is that of the whole process in one run.",
+        "Every method's features go through the same classifiers: a linear SVM, or with kernel rbf Gaussian "
+        "kernel ridge; with kernel auto, the one that folds of training samples say is better. Encoding is "
+        "of all samples, training with the choice of C; the peak is that of the whole process in one run.",
     ]
+    if chosen := [
+        f"{_name(row)} rbf in {row['kernel'].count('rbf')} of {len(row['kernel'])} folds"
+        for row in result["rows"]
+        if row["setting"].get("kernel") == "auto" and "kernel" in row
+    ]:
+        lines.append(f"Kernel auto took: {', '.join(chosen)}.")
     if errors := [
         f"{_name(row)} {row['calibration_error']:.3f}" for row in result["rows"] if "calibration_error" in row
     ]:
