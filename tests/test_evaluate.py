@@ -697,6 +697,8 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     assert same[0]["accuracy"] == same[1]["accuracy"]
     assert base[0]["learned"]["shape"] == [2, 4, 4]
     assert len(base[0]["learned"]["objective"]) == 4
+    assert base[0]["learned"]["kurtosis"] > 1
+    assert 0 < base[0]["learned"]["used"] < 1
     html = page.read_text()
     for title in ("Accuracy", "Sweeps", "Early decision", "Online", "Confusion", "Convergence", "Filters"):
         assert f"<h2>{title}" in html

@@ -65,7 +65,7 @@ def learn_models(folder: Path) -> None:
     model.unlink(missing_ok=True)
     classifier.unlink(missing_ok=True)
     subprocess.run([command, "learn", train, "-o", model, *LEARN_OPTIONS], check=True)
-    subprocess.run([command, "train", train, "-m", model, "-o", classifier], check=True)
+    subprocess.run([command, "train", train, "-m", model, "-o", classifier, "--kernel", "linear"], check=True)
 
 
 def sums(folder: Path) -> str:

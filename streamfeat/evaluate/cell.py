@@ -20,6 +20,7 @@ from streamfeat.classify.selection import with_best_filters
 from streamfeat.classify.training import train
 from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
+from streamfeat.evaluate.codes import code_statistics
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
@@ -31,6 +32,9 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 __all__ = ["run_cells"]
 
 _SHOWN_FILTERS = 48
+
+_CODED_SAMPLES = 200
+"""Held-out samples whose codes are looked at."""
 
 _MIRRORED = Variant(mirror=True)
 
@@ -220,7 +224,8 @@ def _looked_into(
         result["early"] = {"samples": len(chosen), **early_decision(features, classifier, chosen)}
         report("early decision", 1, 1, "")
     if isinstance(features, Encoder):
-        result["learned"] = _learned(features)
+        some = _evenly(recordings, held_out, _CODED_SAMPLES, report)
+        result["learned"] = _learned(features) | code_statistics(features, some, cell.setting.seed)
     return result
 
 
@@ -236,7 +241,7 @@ def _evenly(
     """So many held-out samples, spread evenly over the stream."""
     places = np.flatnonzero(held_out)
     wanted = set(places[np.unique(np.linspace(0, len(places) - 1, most).astype(int))].tolist())
-    report("early decision", 0, 0, "reading samples")
+    report("looking into samples", 0, 0, "reading")
     return [sample for i, sample in enumerate(_samples(recordings)) if i in wanted]
 
 

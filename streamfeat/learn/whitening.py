@@ -15,7 +15,7 @@ from streamfeat.errors import InputError
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.work.workers import Sums
 
-__all__ = ["VolumeWhitener"]
+__all__ = ["VolumeWhitener", "whitened"]
 
 
 class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -81,7 +81,7 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         white = np.empty(volumes.shape, np.float32)
         for start in range(0, len(white), self.chunk_size):
             rows = slice(start, start + self.chunk_size)
-            white[rows] = (_normalised(volumes[rows], self.eps) - self.mean_) @ self.whitening_
+            white[rows] = whitened(volumes[rows], self.eps, self.mean_, self.whitening_)
         return white
 
     def __sklearn_tags__(self) -> Any:
@@ -89,6 +89,13 @@ class VolumeWhitener(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         tags = super().__sklearn_tags__()
         tags.transformer_tags.preserves_dtype = []
         return tags
+
+
+def whitened(
+    volumes: NDArray[Any], eps: float, mean: NDArray[np.float32], whitening: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Volumes `(n, d)` with what a whitener, or an encoder, has learned; float32."""
+    return np.asarray((_normalised(volumes, eps) - mean) @ whitening, np.float32)
 
 
 def _normalised(chunk: NDArray[np.float32], eps: float) -> NDArray[np.float32]:
