@@ -372,7 +372,7 @@ class Engine(Shown):
             state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
             state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        update(self._operator, state)
+        self._update()
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
         state.encoded[:] = 0

@@ -35,8 +35,8 @@ kernel = _kept(**_PLAIN)
 """Compiled once for each set of argument types, kept on disk, and free of the GIL while it runs."""
 
 inlined = _kept(**_PLAIN, no_cpython_wrapper=True, forceinline=True)
-"""The same for small parts of a loop over events: a call would copy all arrays' descriptions. Only kernels can
-call it: to describe forty arrays to Python takes a quarter of a second of compiling."""
+"""The same for small parts of a loop over events: a call would copy all arrays' descriptions. Only kernels
+can call it, Python cannot: to describe forty arrays to it takes a quarter of a second of compiling."""
 
 spliced = _kept(**_PLAIN, inline="always")
 """The same for a sequence of kernels: whoever calls it has its lines, for LLVM would optimise all that is in
