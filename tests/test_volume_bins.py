@@ -1,6 +1,5 @@
 """Volumes shorter than the window: the invariants, the mathematics, the file, learning, bad input."""
 
-import json
 from dataclasses import replace
 
 import naive
@@ -30,6 +29,10 @@ from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.random_encoder import random_encoder
 from streamfeat.errors import InputError
 from streamfeat.events import make_events
+from streamfeat.learn.fit import learn_encoder
+from streamfeat.learn.settings import Setting
+from streamfeat.learn.volumes import Window, sample_volumes
+from streamfeat.recordings.reader import open_recording
 
 EXAMPLES = 15
 ids = "-".join
@@ -360,3 +363,68 @@ def test_times_that_do_not_fit_into_the_window_are_refused_in_one_line(values, w
         Geometry(n_bins=3, **values)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+# Learning and commands
+
+LEARN = {"filters": 6, "patch": 6, "stride": 6, "bins": 3, "volumes": 300, "iterations": 2, "max_count": 2}
+SHORT = {"volume_bins": 2, "time_stride": 1}
+OPTIONS = [f"--{name.replace('_', '-')}={value}" for name, value in (LEARN | SHORT).items()]
+
+
+def test_volumes_are_drawn_from_all_of_the_window():
+    """Each bin of the window has its own count, so that a volume says when it begins."""
+    geometry = Geometry(patch=2, n_bins=4, bin_us=10, max_count=9, volume_bins=2)
+    t = np.repeat(np.arange(4) * 10, (1, 2, 3, 4))
+    events = np.concatenate(
+        [make_events(np.full(10, x), np.full(10, y), np.ones(10, int), t) for x in range(5) for y in range(5)]
+    )
+    volumes = sample_volumes([Window(events, (5, 5), 0, 39)], geometry, 400, (3,)).counts
+    assert volumes.shape == (400, 8)
+    begins = volumes[:, 0]
+    np.testing.assert_array_equal(volumes, np.repeat(np.stack([begins, begins + 1], axis=1), 4, axis=1))
+    assert np.unique(begins).tolist() == [1, 2, 3]
+
+
+def test_commands_learn_and_use_short_volumes(run, tmp_path):
+    path = tiny.write_digits(tmp_path / "digits.mcap", 60, n_held_out=20)
+    run("learn", path, *OPTIONS, "-o", tmp_path / "model")
+    encoder = Encoder.load(tmp_path / "model")
+    assert encoder.geometry.volume_bins == 2
+    assert encoder.filters.shape == (6, 2 * 36)
+    with open_recording(path) as recording:
+        assert learn_encoder([recording], Setting(**LEARN | SHORT)).fingerprint == encoder.fingerprint
+    files = ["-m", tmp_path / "model", "-c", tmp_path / "classifier"]
+    trained = run("train", path, *files[:2], "-o", files[3], "--json").json
+    said = run("replay", path, *files, "--emit", "event", "--split", "test", "--json").json
+    assert said["correct"] / 20 == pytest.approx(trained["held_out_accuracy"])
+    row = run("evaluate", path, "--method", "direct", *OPTIONS, "--early-samples", 0, "--json").json["rows"][
+        0
+    ]
+    assert row["features"] == encoder.n_features
+    assert row["accuracy"] == pytest.approx(trained["held_out_accuracy"])
+
+
+def test_scales_of_fewer_bins_than_a_volume_are_as_long_as_their_window():
+    setting = Setting(bins=5, volume_bins=3, time_stride=2, scales="8+6:3+4:4", volumes=2000)
+    assert [(one.bins, one.volume_bins, one.time_stride) for one in setting.each] == [
+        (5, 3, 2), (5, 3, 2), (3, None, 1), (4, 3, 1),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["learn", "evaluate"])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--volume-bins", "4"], "volume_bins is 4, it must be an integer from 1 to the 3 bins"),
+        (["--volume-bins", "0"], "volume_bins is 0"),
+        (["--volume-bins", "2", "--time-stride", "2"], "time_stride is 2"),
+        (["--time-stride", "0"], "time_stride is 0"),
+    ],
+)
+def test_commands_refuse_times_that_do_not_fit_in_one_line(run, tmp_path, command, options, words):
+    output = ["-o", tmp_path / "new"]
+    said = run(command, tmp_path / "none.mcap", *options, *output)
+    assert said.status == 2
+    assert words in " ".join(said.err.split())
+    assert not (tmp_path / "new").exists()

@@ -24,7 +24,15 @@ from streamfeat.files.safetensors_file import one_line, read_safetensors, write_
 from streamfeat.kernels.layout import FEATURE_ENCODINGS, Operator
 from streamfeat.report.shown import Shown
 
-__all__ = ["GENERAL_VERSION", "NARROW_VERSION", "WIDE_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
+__all__ = [
+    "GENERAL_VERSION",
+    "NARROW_VERSION",
+    "WIDE_VERSION",
+    "Encoder",
+    "Encoding",
+    "FeatureMap",
+    "Formulation",
+]
 
 WIDE_VERSION, NARROW_VERSION, GENERAL_VERSION = 1, 2, 3
 """Format versions of files: the second holds what the first does, and the steps of the narrow state; the
