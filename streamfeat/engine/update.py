@@ -20,7 +20,7 @@ __all__ = ["is_complete", "is_worth_sharing", "update_plane"]
 
 
 def update_plane(operator: Operator, state: State, crew: Crew) -> None:
-    """Make the current plane that of the counts; asks first, for each call of a kernel costs 6 us by itself."""
+    """Make the current plane that of the counts; asks first, for each call of a kernel takes 6 us."""
     if is_complete(operator, state) and not state.clock[CLOCK_TOUCHED]:
         return
     filters = operator.offset.shape[0]
