@@ -43,7 +43,7 @@ def home(tmp_path_factory):
         model, clf = str(home / formulation), str(home / f"{formulation}.clf")
         learn = ["learn", str(home / "train.mcap"), "-o", model, "--formulation", formulation, *LEARN]
         assert runner.invoke(cli.app, learn).exit_code == 0
-        train = ["train", str(home / "train.mcap"), "-m", model, "-o", clf]
+        train = ["train", str(home / "train.mcap"), "-m", model, "-o", clf, "--kernel", "linear"]
         assert runner.invoke(cli.app, train).exit_code == 0
     return home
 

@@ -91,6 +91,8 @@ def test_a_file_holds_both_classifiers(tmp_path):
     again.check_fits(MODEL)
     with pytest.raises(InputError, match="trained with another model"):
         again.check_fits(tiny.encoder(seed=1))
+    alone = Classifier.load(tmp_path / "clf")
+    assert np.array_equal(alone.emitted(fresh), clf.linear.emitted(fresh))
     clf.linear.save(tmp_path / "linear")
     assert isinstance(load_classifier(tmp_path / "linear"), Classifier)
 
@@ -235,6 +237,7 @@ def test_a_committee_is_saved_and_an_unsound_one_is_refused(tmp_path):
     clf, (fresh, _) = committee(), scales(5, seed=2)
     clf.save(tmp_path / "good")
     assert np.array_equal(load_classifier(tmp_path / "good").emitted(fresh), clf.emitted(fresh))
+    assert np.array_equal(Classifier.load(tmp_path / "good").scores(fresh), clf.linear.scores(fresh))
     with safe_open(tmp_path / "good", framework="numpy") as file:
         meta = json.loads(file.metadata()["streamfeat"])
     machines = meta["machines"]

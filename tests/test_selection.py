@@ -109,7 +109,7 @@ def test_train_writes_the_smaller_model_and_its_classifier(run, tmp_path):
     MODEL.save(tmp_path / "model")
     said = run(
         "train", path, "-m", tmp_path / "model", "-o", tmp_path / "clf", "--select", 3, "--selected-model",
-        tmp_path / "small", "--mirror", "--json",
+        tmp_path / "small", "--mirror", "--kernel", "linear", "--json",
     ).json  # fmt: skip
     assert said["selected_model"] == str(tmp_path / "small")
     small = Encoder.load(tmp_path / "small")

@@ -32,11 +32,14 @@ from streamfeat.files.safetensors_file import read_safetensors, write_safetensor
 from streamfeat.kernels.predict import Weights
 from streamfeat.report.shown import Shown
 
-__all__ = ["Classifier", "normalise_features", "train_classifier"]
+__all__ = ["KERNEL_KIND", "KERNEL_VERSION", "Classifier", "normalise_features", "train_classifier"]
 
 FORMAT_VERSION = 1
 
 _KIND = "streamfeat-classifier"
+
+KERNEL_KIND, KERNEL_VERSION = "streamfeat-kernel-classifier", 2
+"""Of files that have a kernel beside the linear classifier, and the latest version of those."""
 
 _POWERS = -9, 3
 """Of ten: the smallest and the largest C that is tried."""
@@ -173,10 +176,20 @@ class Classifier(Shown):
     def load(cls, path: str | Path) -> Self:
         """Read a classifier; every shape, type and range is checked, and nothing in the file is run.
 
+        Of a file with a kernel, as `train` may write it, the linear classifier that is in it as well.
+
         Raises:
             InputError: the file is missing, cut short, of another version, or not a classifier.
         """
-        return cls.from_parts(path, *read_safetensors(Path(path), _KIND, FORMAT_VERSION))
+        arrays, header = read_safetensors(Path(path), (_KIND, KERNEL_KIND), FORMAT_VERSION, KERNEL_VERSION)
+        if header["format"] == KERNEL_KIND:
+            header = {**header, "temperature": header.get("linear_temperature")}
+        elif header["version"] != FORMAT_VERSION:
+            raise InputError(
+                f"{path}: format version {header['version']}, this streamfeat reads version {FORMAT_VERSION} "
+                "of linear classifiers; make the file again"
+            )
+        return cls.from_parts(path, arrays, header)
 
     @classmethod
     def from_parts(

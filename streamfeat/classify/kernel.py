@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.classify.calibration import checked_temperature, fitted_temperature, probabilities
-from streamfeat.classify.classifier import Classifier
+from streamfeat.classify.classifier import KERNEL_KIND, KERNEL_VERSION, Classifier
 from streamfeat.classify.machine import Cells, KernelMachine, folded_scores, trained_machine
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
@@ -34,8 +34,7 @@ __all__ = ["KERNEL_SHARE", "MOST_POINTS", "KernelClassifier", "load_classifier",
 MOST_POINTS = 32_768
 """Training rows at most: the kernel matrix, float32, takes 4 GiB then while it is factored."""
 
-_KERNEL_KIND = "streamfeat-kernel-classifier"
-_ONE_CELL, _COMMITTEE = 1, 2
+_ONE_CELL, _COMMITTEE = 1, KERNEL_VERSION
 """Versions of its file: the first holds one machine whose features are normalised as a whole."""
 
 KERNEL_SHARE = "kernel_cross_validation"
@@ -116,7 +115,7 @@ class KernelClassifier(Shown):
             for i, machine in enumerate(self.machines):
                 arrays |= {f"{name}.{i}": getattr(machine, name) for name in _PARTS}
             header |= {"machines": [{"cells": [*m.cells], "gamma": m.gamma} for m in self.machines]}
-        write_safetensors(Path(path), _KERNEL_KIND, version, arrays, header)
+        write_safetensors(Path(path), KERNEL_KIND, version, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -125,7 +124,7 @@ class KernelClassifier(Shown):
         Raises:
             InputError: the file is missing, cut short, of another version, or not a kernel classifier.
         """
-        arrays, header = read_safetensors(Path(path), _KERNEL_KIND, _ONE_CELL, _COMMITTEE)
+        arrays, header = read_safetensors(Path(path), KERNEL_KIND, _ONE_CELL, _COMMITTEE)
         of_linear = {**header, "temperature": header.get("linear_temperature")}
         linear = Classifier.from_parts(path, arrays, of_linear)
         n_features, n_labels = len(linear.centre), len(linear.labels)
@@ -190,7 +189,7 @@ def load_classifier(path: str | Path) -> Classifier | KernelClassifier:
     try:
         return KernelClassifier.load(path)
     except InputError as error:
-        if f"not a {_KERNEL_KIND} file" not in str(error):
+        if f"not a {KERNEL_KIND} file" not in str(error):
             raise
     return Classifier.load(path)
 
