@@ -148,7 +148,7 @@ def test_train_and_evaluate_take_them(run, tmp_path):
     from streamfeat.classify.kernel import load_classifier
 
     trained = load_classifier(tmp_path / "clf")
-    assert len(trained.points) == 30 * 10
+    assert len(trained.machines[0].points) == 30 * 10
     assert trained.provenance["variants"][:2] == ["first 20 ms", "first 40 ms"]
     refused = run(*train, tmp_path / "other", "--cuts", "soon")
     assert (refused.status, "such as 33+67" in refused.err) == (2, True)
