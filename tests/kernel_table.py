@@ -1101,6 +1101,11 @@ def make_renew(rng):
     return *random_share(rng, state), operator, state
 
 
+def make_first_with_load(rng):
+    load = np.sort(rng.integers(0, 50, int(rng.integers(1, 12)))).astype(np.int32)
+    return int(rng.integers(0, 60)), load, int(rng.integers(0, len(load) + 1))
+
+
 def make_share_of_load(rng):
     part, parts, _, state = make_complete(rng)
     return part, parts, state
@@ -1713,6 +1718,7 @@ KERNELS = [
     Row(planes.count_filled, make_count_filled, exact_but_lines),
     Row(planes.list_missing, make_list_missing, exact_list),
     Row(planes.share_of, make_share_of),
+    Row(planes.first_with_load, make_first_with_load),
     Row(planes.share_of_load, make_share_of_load),
     Row(planes.finish, make_finish),
     Row(planes.fill_plane, make_fill_plane, exact_but_atoms),

@@ -831,6 +831,10 @@ def _filled_pixels(volume, operator, state):
     return int(windows.any(axis=0).sum())
 
 
+def first_with_load(least, load, n):
+    return next((i for i in range(n) if load[i] >= least), n)
+
+
 def share_of_load(part, parts, state):
     n = int(state.clock[CLOCK_DIRTY])
     load = state.load[: n + 1].astype(float)
