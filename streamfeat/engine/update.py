@@ -48,5 +48,6 @@ def _most_volumes(operator: Operator, state: State) -> int:
     volumes = operator.shape[0] * operator.shape[1]
     if not is_complete(operator, state):
         return volumes
-    covering = -((-operator.patch // operator.stride) ** 2)
+    rows, columns = (-(-side // operator.stride) for side in operator.patch)
+    covering = rows * columns
     return len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * covering)
