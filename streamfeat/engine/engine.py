@@ -21,7 +21,7 @@ from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, 
 from streamfeat.engine.state import allocate_state, clear_state, enter_counts
 from streamfeat.engine.threads import Crew, one_thread
 from streamfeat.engine.trace import Trace, joined, trace_events
-from streamfeat.engine.update import is_complete, update_plane
+from streamfeat.engine.update import is_complete, is_worth_sharing, update_plane
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow
@@ -38,7 +38,7 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.planes import look_ahead
 from streamfeat.kernels.predict import Weights
-from streamfeat.kernels.update import read, update
+from streamfeat.kernels.update import read
 from streamfeat.report.shown import Shown
 
 __all__ = ["Engine", "EngineStats"]
@@ -209,6 +209,8 @@ class Engine(Shown):
         Returns:
             whether nothing is left to prepare.
         """
+        if len(self._state.cursors) == 1:  # there is no plane that could look ahead
+            return True
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
         left = look_ahead(volumes, volumes, columns, self._operator, self._state)
@@ -245,7 +247,7 @@ class Engine(Shown):
     @one_thread
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._crew.threads > 1 or self._past:
+        if self._past or is_worth_sharing(self._operator, self._state, self._crew):
             self._update()
         features = np.zeros(self.encoder.n_features, np.float32)
         read(self._operator, self._state, features[: n_features(self._operator)])
@@ -379,7 +381,7 @@ class Engine(Shown):
             enter_counts(self._past.newest_counts(), snapshot.bin, operator, state)
         codes[:] = snapshot.atoms
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        update(operator, state)
+        update_plane(operator, state, self._crew)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         self._window.tally[:] = snapshot.tally
         state.encoded[:] = 0

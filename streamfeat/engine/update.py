@@ -1,6 +1,6 @@
-"""Bringing the current plane up to date, on one thread or on several.
+"""Bringing the current plane up to date step by step, so that threads can share the steps.
 
-Lives here: whether there is anything to do, whether it is worth a thread, the order of the steps.
+Lives here: whether there is anything to do, whether there is enough for several threads, the order of steps.
 Not here: the steps (`kernels.update`, `kernels.planes`), how a step is shared (`threads`).
 """
 
@@ -14,19 +14,16 @@ from streamfeat.kernels.layout import (
     State,
 )
 from streamfeat.kernels.planes import complete, finish, list_missing
-from streamfeat.kernels.update import mark_dirty, renew, settle, update
+from streamfeat.kernels.update import mark_dirty, renew, settle
 
-__all__ = ["is_complete", "update_plane"]
+__all__ = ["is_complete", "is_worth_sharing", "update_plane"]
 
 
 def update_plane(operator: Operator, state: State, crew: Crew) -> None:
-    """Make the current plane that of the counts; asks first, for a call of a kernel costs 10 us by itself."""
+    """Make the current plane that of the counts; asks first, for each call of a kernel takes 6 us."""
     if is_complete(operator, state) and not state.clock[CLOCK_TOUCHED]:
         return
     filters = operator.offset.shape[0]
-    if not crew.is_worth_counting(_most_volumes(operator, state) * filters):
-        update(operator, state)
-        return
     mark_dirty(operator, state)
     renewing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
     crew.share(renew, renewing, operator, state)
@@ -43,11 +40,10 @@ def is_complete(operator: Operator, state: State) -> bool:
     return bool(coded == operator.shape[0] * operator.shape[1])
 
 
-def _most_volumes(operator: Operator, state: State) -> int:
-    """A bound of the volumes that an update has to work on."""
+def is_worth_sharing(operator: Operator, state: State, crew: Crew) -> bool:
+    """Whether there may be enough to do for several threads, by a bound of the volumes to work on."""
     volumes = operator.shape[0] * operator.shape[1]
-    if not is_complete(operator, state):
-        return volumes
-    rows, columns = (-(-side // operator.stride) for side in operator.patch)
-    covering = rows * columns
-    return len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * covering)
+    if is_complete(operator, state):
+        rows, columns = (-(-side // operator.stride) for side in operator.patch)
+        volumes = len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * rows * columns)
+    return crew.is_worth_counting(volumes * operator.offset.shape[0])

@@ -13,7 +13,7 @@ from streamfeat.engine.state import allocate_state
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.layout import CLOCK_SLOT, Operator, State
-from streamfeat.kernels.planes import fill_plane
+from streamfeat.kernels.planes import ALONE, FIRST, complete, finish, list_missing
 
 __all__ = ["add_volumes", "count_window", "encode_window"]
 
@@ -68,7 +68,9 @@ def add_volumes(counts: NDArray[np.int16], operator: Operator, state: State) -> 
     state.clock[CLOCK_SLOT] = len(counts) - 1  # the volumes end with the last slot
     state.cursors[:] = 0
     state.atoms[:] = 0  # codes of the lasso follow from the counts alone
-    fill_plane(operator, state)
+    list_missing(operator, state)
+    complete(FIRST, ALONE, operator, state)
+    finish(ALONE, operator, state)
 
 
 def encode_window(
