@@ -870,6 +870,12 @@ MULTIPLY = {
     "an odd number of entries": lambda call: len(call.operator.columns) % 2 == 1,
     "several blocks of filters": lambda call: call.operator.columns.shape[1] > 32,
 }
+FIRST_WITH_LOAD = {
+    "of none": lambda call: call.n == 0,
+    "the first": lambda call: call.n > 0 and call.result == 0,
+    "one in the middle": lambda call: 0 < call.result < call.n,
+    "no volume has so much before it": lambda call: 0 < call.n == call.result,
+}
 SHARE_OF_LOAD = {
     "nothing": lambda call: call.state.clock[CLOCK_DIRTY] == 0,
     "all of it": lambda call: call.parts == 1 and call.state.clock[CLOCK_DIRTY] > 0,
@@ -1310,6 +1316,7 @@ CASES = {
     "project_volume": PROJECT_VOLUME,
     "let_in": LET_IN,
     "multiply": MULTIPLY,
+    "first_with_load": FIRST_WITH_LOAD,
     "share_of_load": SHARE_OF_LOAD,
     "complete": COMPLETE,
     "look_ahead": LOOK_AHEAD,
