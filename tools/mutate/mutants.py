@@ -699,8 +699,8 @@ MUTANTS = [
     Mutant(
         "the mean is not subtracted",
         "learn/whitening.py",
-        "(_normalised(volumes[rows], self.eps) - self.mean_) @ self.whitening_",
-        "_normalised(volumes[rows], self.eps) @ self.whitening_",
+        "(_normalised(volumes, eps) - mean) @ whitening",
+        "_normalised(volumes, eps) @ whitening",
         "tests/test_learn.py",
     ),
     # evaluate
