@@ -24,6 +24,7 @@ from torture.damage import damaged_recordings  # noqa: E402
 from torture.faults import faults  # noqa: E402
 from torture.fuzz import hostile_bytes  # noqa: E402
 from torture.hours import hours  # noqa: E402
+from torture.interrupts import interrupts  # noqa: E402
 from torture.kills import kills  # noqa: E402
 from torture.outside import outside  # noqa: E402
 from torture.soak import soak  # noqa: E402
@@ -36,6 +37,7 @@ PARTS: dict[str, tuple[Part, str]] = {
     "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
     "state": (state, "kill -9 of a listener that keeps its state"),
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
+    "interrupts": (interrupts, "SIGINT, SIGTERM and SIGHUP in every phase of every command, within a second"),
     "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
     "outside": (outside, "pages of browsers, silent clients, claims of gigabytes, names that do things"),
     "hours": (hours, "two hours of listen, record and view: cameras, disks, clocks and browsers"),
