@@ -295,6 +295,12 @@ class Engine(Shown):
         """Events accepted and counted, as in `stats()`."""
         return int(self._state.tally[TALLY_EVENTS])
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of its arrays; a system gives it their pages as they are first used."""
+        mine = sum(array.nbytes for array in self._state if isinstance(array, np.ndarray))
+        return mine + sum(scale.held_bytes for _, scale in self._further)
+
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
         events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)

@@ -30,6 +30,7 @@ from torture.outside import outside  # noqa: E402
 from torture.soak import soak  # noqa: E402
 from torture.state import state  # noqa: E402
 from torture.table import Part, Row, Trials, markdown  # noqa: E402
+from torture.viewers import viewers  # noqa: E402
 
 PARTS: dict[str, tuple[Part, str]] = {
     "bytes": (hostile_bytes, "every decoder, fed with hostile bytes"),
@@ -39,6 +40,7 @@ PARTS: dict[str, tuple[Part, str]] = {
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
     "interrupts": (interrupts, "SIGINT, SIGTERM and SIGHUP in every phase of every command, within a second"),
     "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
+    "viewers": (viewers, "what a view sees without end: new cameras, and browsers that come and go"),
     "outside": (outside, "pages of browsers, silent clients, claims of gigabytes, names that do things"),
     "hours": (hours, "two hours of listen, record and view: cameras, disks, clocks and browsers"),
     "soak": (soak, "a day of stream time, 500 million events"),
