@@ -29,7 +29,7 @@ from streamfeat.cli import (
 )
 from streamfeat.cli.blas import spare_blas
 from streamfeat.cli.program import app, err
-from streamfeat.errors import InputError
+from streamfeat.errors import InputError, printable
 from streamfeat.files.outputs import remove_unfinished
 from streamfeat.work import interrupts
 
@@ -96,9 +96,17 @@ def _run() -> int:
     except MemoryError as error:
         err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
         return 2
+    except PermissionError as error:  # somewhere in the path of an input or output
+        err.print(f"[bold red]error:[/] {escape(printable(_denied(error)))}", soft_wrap=True)
+        return 2
     except KeyboardInterrupt:
         return interrupts.INTERRUPTED
     return status if isinstance(status, int) else 0
+
+
+def _denied(error: PermissionError) -> str:
+    """Which path another user keeps from this one."""
+    return f"{os.fsdecode(error.filename or 'something')}: {error.strerror}; may this user read and enter it?"
 
 
 def _drop_output() -> None:
