@@ -51,6 +51,20 @@ def test_a_camera_whose_engine_is_too_much_for_all_is_refused_alone():
     assert cameras.topics == ["b", "c"]
 
 
+def test_what_was_too_large_is_not_made_again_to_be_weighed():
+    made = []
+
+    def make(*arguments, **options):
+        made.append(1)
+        return Engine(*arguments, **options)
+
+    session = Session(MODEL, EmitPolicy.parse("10ms"), engine=Room(WEIGHT - 1).maker("a", make))
+    for _ in range(3):
+        with pytest.raises(MemoryError, match="--memory BYTES"):
+            [*session.process(packet("a"))]
+    assert len(made) == 1
+
+
 def test_the_engine_that_a_camera_had_before_is_not_counted():
     """It has another resolution now; for a moment both are there."""
     told, room = [], Room(4 * WEIGHT)

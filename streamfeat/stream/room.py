@@ -13,7 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
+from streamfeat.events import Resolution
 from streamfeat.files.budget import parse_bytes
 
 __all__ = ["MEMORY", "Room", "usable_bytes"]
@@ -22,6 +24,7 @@ MEMORY = "STREAMFEAT_MEMORY"
 """Environment variable with the limit, such as `4G`; `streamfeat --memory 4G COMMAND` sets it."""
 
 _SHARE = 2
+_SIZES_KNOWN = 64
 _GROUP_LIMITS = "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"
 
 
@@ -49,6 +52,7 @@ class Room:
         """No engine is there yet."""
         self._most = usable_bytes() if most_bytes is None else most_bytes
         self._held: weakref.WeakKeyDictionary[Engine, str] = weakref.WeakKeyDictionary()
+        self._too_large: dict[Resolution, int] = {}
 
     @property
     def held_bytes(self) -> int:
@@ -61,20 +65,30 @@ class Room:
         The engine that it replaces, of the same camera, is not counted.
         """
 
-        def weighed(*arguments: Any, **options: Any) -> Engine:
-            engine = make(*arguments, **options)
-            mine = engine.held_bytes
-            others = sum(one.held_bytes for one, of in list(self._held.items()) if of != topic)
-            if others + mine > self._most:
-                raise MemoryError(
-                    f"its engine of {_mega(mine)} and the {_mega(others)} of others are more than the "
-                    f"{_mega(self._most)} that they may have; `streamfeat --memory BYTES COMMAND` allows "
-                    "more, a model with a larger stride or downsample needs less"
-                )
+        def weighed(encoder: Encoder, resolution: Resolution, **options: Any) -> Engine:
+            # Where one of this size was too much none is made: a packet may ask a hundred times a second.
+            self._refuse(topic, self._too_large.get(resolution, 0))
+            engine = make(encoder, resolution, **options)
+            try:
+                self._refuse(topic, engine.held_bytes)
+            except MemoryError:
+                if len(self._too_large) >= _SIZES_KNOWN:
+                    self._too_large.clear()
+                self._too_large[resolution] = engine.held_bytes
+                raise
             self._held[engine] = topic
             return engine
 
         return weighed
+
+    def _refuse(self, topic: str, mine: int) -> None:
+        others = sum(one.held_bytes for one, of in list(self._held.items()) if of != topic)
+        if others + mine > self._most:
+            raise MemoryError(
+                f"its engine of {_mega(mine)} and the {_mega(others)} of others are more than the "
+                f"{_mega(self._most)} that they may have; `streamfeat --memory BYTES COMMAND` allows more, a "
+                "model with a larger stride or downsample needs less"
+            )
 
 
 def _mega(n_bytes: int) -> str:

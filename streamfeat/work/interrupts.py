@@ -17,6 +17,7 @@ A second interrupt, `AGAIN_S` later or more, ends the process at once in any cas
 ended here: a program that calls this package gets `KeyboardInterrupt`, or the function.
 """
 
+import atexit
 import os
 import select
 import signal
@@ -85,6 +86,7 @@ class _Interrupts:
         self.phases: list[_Phase] = []
         self.at_leaving: list[Callable[[], object]] = []
         self.words = ""
+        self.status = INTERRUPTED
         self.heard_s: float | None = None
         self._leave_at_s: float | None = None
         self._waiting = self._raised = False
@@ -137,6 +139,11 @@ class _Interrupts:
         os.write(self._ends[1], bytes([_QUIT]))
         self._watcher.join()
         self._close()
+
+    def deafen(self) -> None:
+        """Let the interpreter end: the last that it does is to give signals back to the system."""
+        for number in self._before:
+            signal.signal(number, signal.SIG_IGN)
 
     def forget(self) -> None:
         """In a process that was forked: its parent's thread and its ends of the pipe are not its own."""
@@ -207,7 +214,7 @@ class _Interrupts:
                 if os.isatty(number):
                     os.write(number, _SHOW_CURSOR)
                     break
-        os._exit(INTERRUPTED)
+        os._exit(self.status)
 
     def clean_up(self) -> None:
         """Remove what is unfinished, end processes that were started."""
@@ -265,13 +272,19 @@ def take_last_words() -> str:
 
 
 def end(status: int) -> NoReturn:
-    """End a command: after an interrupt without waiting for threads that are still at work."""
-    if _interrupts.leaves and _interrupts.heard_s is not None:
-        _interrupts.clean_up()
+    """End a command: after an interrupt without waiting for threads that are still at work.
+
+    An interrupt from here on changes nothing of what came of it: the process ends at once, with this status.
+    """
+    if _interrupts.leaves:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        os._exit(status)
+        _interrupts.status = status
+        _interrupts.phases = [_Phase(ends=True)]
+        if _interrupts.heard_s is not None:
+            _interrupts.leave()
+        atexit.register(_interrupts.deafen)
     sys.exit(status)
 
 

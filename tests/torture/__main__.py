@@ -29,6 +29,7 @@ from torture.kills import kills  # noqa: E402
 from torture.outside import outside  # noqa: E402
 from torture.soak import soak  # noqa: E402
 from torture.state import state  # noqa: E402
+from torture.surroundings import surroundings  # noqa: E402
 from torture.table import Part, Row, Trials, markdown  # noqa: E402
 from torture.viewers import viewers  # noqa: E402
 
@@ -42,6 +43,7 @@ PARTS: dict[str, tuple[Part, str]] = {
     "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
     "viewers": (viewers, "what a view sees without end: new cameras, and browsers that come and go"),
     "outside": (outside, "pages of browsers, silent clients, claims of gigabytes, names that do things"),
+    "surroundings": (surroundings, "other users, clocks that are set, suspending, 1 % of a core, routers"),
     "hours": (hours, "two hours of listen, record and view: cameras, disks, clocks and browsers"),
     "soak": (soak, "a day of stream time, 500 million events"),
 }
