@@ -36,6 +36,8 @@ __all__ = [
     "Start",
     "Stride",
     "Threshold",
+    "TimeStride",
+    "VolumeBins",
     "Volumes",
     "WindowMs",
     "setting_given",
@@ -66,7 +68,13 @@ Filters = Annotated[
     int | None, typer.Option(help="Number of filters or atoms, K.", show_default=_shown("filters"))
 ]
 Patch = Annotated[
-    int | None, typer.Option(help="Pixels along a side of a local volume.", show_default=_shown("patch"))
+    str | None,
+    typer.Option(
+        metavar="PIXELS",
+        help="Pixels along a side of a local volume; ROWSxCOLUMNS such as 8x16; or sensor, for all of the "
+        "largest sensor.",
+        show_default=_shown("patch"),
+    ),
 ]
 Stride = Annotated[
     int | None, typer.Option(help="Pixels between neighbouring volumes.", show_default=_shown("stride"))
@@ -88,6 +96,19 @@ Pooling = Annotated[
     int | None,
     typer.Option(
         help="Cells along each side, in each of which codes are summed.", show_default=_shown("pooling")
+    ),
+]
+VolumeBins = Annotated[
+    int | None,
+    typer.Option(
+        help="Bins of a local volume, fewer than the window has; codes are summed over time then, too.",
+        show_default="those of the window",
+    ),
+]
+TimeStride = Annotated[
+    int | None,
+    typer.Option(
+        help="Bins between volumes at the same place, with --volume-bins.", show_default=_shown("time_stride")
     ),
 ]
 Lambda0 = Annotated[

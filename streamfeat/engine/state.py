@@ -15,7 +15,9 @@ from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
+    CLOCK_SLOT,
     CLOCK_START,
+    MOMENT_SQUARES,
     QUEUE,
     SPLIT,
     Operator,
@@ -23,7 +25,7 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.vectors import MASK_BITS
 
-__all__ = ["allocate_state"]
+__all__ = ["allocate_state", "clear_state", "enter_counts"]
 
 
 def allocate_state(
@@ -69,8 +71,8 @@ def allocate_state(
         touched_slots=np.zeros(geometry.n_bins, np.uint8),
         ring_rows=(np.arange(resolution[0]) // geometry.downsample).astype(np.int32),
         ring_columns=(np.arange(resolution[1]) // geometry.downsample).astype(np.int32),
-        volume_rows=_covering(geometry, ring[1], rows),
-        volume_columns=_covering(geometry, ring[2], columns),
+        volume_rows=_covering(geometry.sides[0], geometry.stride, ring[1], rows),
+        volume_columns=_covering(geometry.sides[1], geometry.stride, ring[2], columns),
         clock=clock,
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
@@ -101,14 +103,43 @@ def allocate_state(
     )
 
 
+def clear_state(state: State, origin_us: int) -> None:
+    """Make a state that of an engine without events whose bin 0 starts at `origin_us`; tallies stay."""
+    state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
+    for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
+        array[:] = 0
+    state.pooled[:] = 0
+    state.cursors[:] = 0
+    state.clock[:] = 0
+    state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+    state.clock[CLOCK_ORIGIN] = origin_us
+
+
+def enter_counts(counts: NDArray[np.int32], now: int, operator: Operator, state: State) -> None:
+    """Give a cleared state the counts of a window; planes follow with the next update.
+
+    Args:
+        counts: `(T, H, W)`, bin `b` in slot `b % T`.
+        now: the current bin.
+        operator: limit of counts, length of a bin.
+        state: changed.
+    """
+    state.counts[:] = counts
+    state.applied[:] = counts.clip(-operator.max_count, operator.max_count)
+    if now > BEFORE_TIME:
+        state.clock[CLOCK_NOW] = now
+        state.clock[CLOCK_START] = state.clock[CLOCK_ORIGIN] + now * operator.bin_us
+        state.clock[CLOCK_SLOT] = now % len(counts)
+
+
 def _cells(pooling: int, rows: int, columns: int) -> NDArray[np.int32]:
     """Cell of each volume of a grid, row by row: the sides of the grid are cut into `pooling` equal parts."""
     down, across = np.arange(rows) * pooling // rows, np.arange(columns) * pooling // columns
     return np.add.outer(down * pooling, across).astype(np.int32).ravel()
 
 
-def _covering(geometry: Geometry, pixels: int, volumes: int) -> NDArray[np.int32]:
+def _covering(side: int, stride: int, pixels: int, volumes: int) -> NDArray[np.int32]:
     """First and last plus one of the volumes along an axis that cover each of `n` pixels: `(n, 2)`."""
-    starts, pixel = np.arange(volumes) * geometry.stride, np.arange(pixels)
-    first = np.searchsorted(starts, pixel - geometry.patch, side="right")
+    starts, pixel = np.arange(volumes) * stride, np.arange(pixels)
+    first = np.searchsorted(starts, pixel - side, side="right")
     return np.stack([first, np.searchsorted(starts, pixel, side="right")], axis=1).astype(np.int32)

@@ -22,7 +22,7 @@ complete when its bin begins is completed then.
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.compiled import inlined, kernel, spliced
 from streamfeat.kernels.dense import can_wait, let_in, multiply
 from streamfeat.kernels.encode import ADD, pool_volume
 from streamfeat.kernels.ingest import slot_of
@@ -75,7 +75,7 @@ def project_volume(
     projection, moments = state.projections[plane, row], state.moments[plane, row]
     values, entries, changes = state.values[part, 0], state.entries[part], state.changes[part]
     n_bins, patch, columns = state.applied.shape[0], operator.patch, operator.shape[1]
-    end = (n_bins - ahead) * patch * patch
+    end = (n_bins - ahead) * patch[0] * patch[1]
     top, left = volume // columns * operator.stride, volume % columns * operator.stride
     first = np.int64(0) if operator.quadratic.shape[0] else start
     gather_volume(state.applied, slot_of(ahead, state), first, end, top, left, patch, values)
@@ -184,12 +184,12 @@ def list_missing(operator: Operator, state: State) -> None:
     plane, columns, load = state.clock[CLOCK_PLANE], operator.shape[1], np.int64(0)
     n_volumes, n, coded = operator.shape[0] * columns, 0, state.cursors[plane, CURSOR_CODED]
     if coded < n_volumes:
-        count_filled(state.applied, operator.stride, operator.patch, state.lines, state.crowds)
+        count_filled(state.applied, operator.stride, operator.patch[1], state.lines, state.crowds)
         moments, is_shared = state.moments[plane], state.moments.shape[1] < n_volumes
         crowd = state.crowds[state.crowds.shape[0] - 1]
         for r in range(coded // columns, operator.shape[0]):
             crowd[:] = 0
-            for row in range(r * operator.stride, r * operator.stride + operator.patch):
+            for row in range(r * operator.stride, r * operator.stride + operator.patch[0]):
                 counts = state.crowds[row]
                 for c in range(columns):
                     crowd[c] += counts[c]
@@ -211,13 +211,25 @@ def share_of(part: int, parts: int, state: State) -> tuple[int, int]:
 
 
 @inlined
+def first_with_load(least: int, load: NDArray[np.int32], n: int) -> int:
+    """The first of `n` volumes on the dirty stack before which there is at least so much work; or `n`."""
+    low, high = 0, n
+    while low < high:
+        middle = (low + high) // 2
+        if load[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
 def share_of_load(part: int, parts: int, state: State) -> tuple[int, int]:
     """The same for volumes that `list_missing` found, in parts of nearly the same work."""
     n = state.clock[CLOCK_DIRTY]
-    before, total = state.load[:n], np.int64(state.load[n])
-    first = np.searchsorted(before, -(-total * part // parts))
-    last = np.searchsorted(before, -(-total * (part + 1) // parts))
-    return int(first), int(last)
+    total = np.int64(state.load[n])
+    first = first_with_load(-(-total * part // parts), state.load, n)
+    return first, first_with_load(-(-total * (part + 1) // parts), state.load, n)
 
 
 @kernel
@@ -268,7 +280,7 @@ def finish(parts: int, operator: Operator, state: State) -> None:
     state.clock[CLOCK_DIRTY] = 0
 
 
-@kernel
+@spliced
 def fill_plane(operator: Operator, state: State) -> None:
     """Let all volumes that are missing enter the current plane."""
     list_missing(operator, state)
@@ -303,7 +315,7 @@ def look_ahead(projected: int, coded: int, budget: int, operator: Operator, stat
         end = d
         # What is empty now will be empty then.
         if start > 0 or state.moments[current, volume, MOMENT_SQUARES] or moments[volume, MOMENT_SQUARES]:
-            end -= operator.patch * operator.patch
+            end -= operator.patch[0] * operator.patch[1]
             if start == 0 and budget >= d and can_wait(state):
                 n, waiting = let_in(plane, volume, NEXT, waiting, part, operator, state)
                 start = end

@@ -14,7 +14,7 @@ from streamfeat.errors import InputError
 if TYPE_CHECKING:
     from streamfeat.engine.encoder import Encoding, Formulation
 
-__all__ = ["DEFAULTS", "PRESETS", "THRESHOLD", "Setting", "preset_with"]
+__all__ = ["DEFAULTS", "PRESETS", "SENSOR", "THRESHOLD", "Setting", "parse_patch", "preset_with"]
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -44,6 +44,28 @@ THRESHOLD = 1.0
 """Default threshold of encoding."""
 
 
+SENSOR = "sensor"
+"""Instead of a patch: one as large as the sensor."""
+
+
+def parse_patch(value: Any) -> int | str:
+    """A patch as it is given, in its one spelling: 12, `8x16` or `sensor`.
+
+    Raises:
+        InputError: it is none of these.
+    """
+    text = "x".join(map(str, value)) if isinstance(value, list | tuple) else str(value).strip().lower()
+    found = re.fullmatch(r"([1-9]\d{0,3})(?:x([1-9]\d{0,3}))?", text)
+    if text == SENSOR:
+        return SENSOR
+    if not found:
+        raise InputError(
+            f"patch {str(value)!r} is not understood; give pixels such as 12, ROWSxCOLUMNS such as 8x16, or "
+            "sensor"
+        )
+    return int(found[1]) if found[2] in (None, found[1]) else text
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
     """The settings of `streamfeat learn`: geometry and learning, with their defaults.
@@ -54,7 +76,8 @@ class Setting:
         formulation: which of the paper's problems is solved, `direct` or `inverse`.
         encoding: what is pooled, `soft`, `split` or `triangle`.
         filters: number of filters or atoms, `K`.
-        patch: rows and columns of a local volume, in ring pixels.
+        patch: ring pixels along each side of a local volume; `8x16`, or two numbers, for rows and columns;
+            `sensor` for all of the largest sensor in the recordings (a fully connected layer).
         stride: ring pixels between neighbouring volumes.
         bins: time bins in the window.
         window_ms: length of the window; None for one that holds 95 % of the labelled
@@ -62,6 +85,9 @@ class Setting:
         downsample: sensor pixels along each side of a ring pixel.
         max_count: counts are clipped to `[-max_count, max_count]`.
         pooling: cells along each side of the grid of volumes; codes are summed over each cell.
+        volume_bins: bins of a local volume; None for all of the window. Codes of shorter ones are summed over
+            time, too. A further scale of no more bins than that has volumes as long as its window.
+        time_stride: bins between volumes at the same place; 1 where `volume_bins` is None.
         lambda0: sparsity penalty in learning; None for that of `LAMBDAS`.
         threshold: of encoding, in units of unit-length filters.
         start: of learning, `kmeans` or `random`.
@@ -83,13 +109,15 @@ class Setting:
     formulation: "Formulation" = "direct"
     encoding: "Encoding" = "split"
     filters: int = 400
-    patch: int = 12
+    patch: int | str = 12
     stride: int = 2
     bins: int = 3
     window_ms: float | None = None
     downsample: int = 1
     max_count: int = 1
     pooling: int = 2
+    volume_bins: int | None = None
+    time_stride: int = 1
     lambda0: float | None = None
     threshold: float = THRESHOLD
     start: str = "kmeans"
@@ -105,6 +133,7 @@ class Setting:
     def __post_init__(self) -> None:
         """Check what can be checked without a recording."""
         from streamfeat.engine.encoder import Encoding, Formulation
+        from streamfeat.engine.geometry import Geometry
 
         for name, kind in (("formulation", Formulation), ("encoding", Encoding)):
             if getattr(self, name) not in get_args(kind):
@@ -135,16 +164,39 @@ class Setting:
                 raise InputError(f"{name} is a weight for filters of any length; give --rows free with it")
         if self.volumes < 2 or self.iterations < 1 or self.filters < 1:
             raise InputError("at least two volumes, one iteration and one filter are needed to learn")
-        entries = self.bins * self.patch * self.patch
-        if self.volumes < max(self.filters, entries + 1):
-            raise InputError(
-                f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
-                f"{entries} entries; learn from at least {max(self.filters, entries + 1)}"
-            )
+        times = Geometry(n_bins=self.bins, volume_bins=self.volume_bins, time_stride=self.time_stride)
+        object.__setattr__(self, "patch", parse_patch(self.patch))
+        rows, columns = (1, 1) if self.patch == SENSOR else self.sides((0, 0))
+        self.check_volumes(times.depth * rows * columns)
         if not 0 <= self.seed < 2**32:
             raise InputError(f"seed is {self.seed}, it must be from 0 to 2^32 - 1")
         if self.scales != "none":
             self.each  # noqa: B018  (refuses what makes no sense)
+
+    def sides(self, resolution: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of a local volume, in ring pixels.
+
+        Args:
+            resolution: `(height, width)` of the largest sensor; it matters for `sensor` only.
+        """
+        if self.patch == SENSOR:
+            height, width = (-(-side // self.downsample) for side in resolution)
+            return height, width
+        rows, _, columns = str(self.patch).partition("x")
+        return int(rows), int(columns or rows)
+
+    def check_volumes(self, entries: int) -> None:
+        """Refuse to learn from too few volumes of so many entries.
+
+        Raises:
+            InputError: with the number that is enough.
+        """
+        if self.volumes < max(self.filters, entries + 1):
+            raise InputError(
+                f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
+                f"{entries} entries; learn from at least {max(self.filters, entries + 1)}"
+                + (", or with a higher downsample" if self.patch == SENSOR else "")
+            )
 
     @property
     def each(self) -> "tuple[Setting, ...]":
@@ -165,12 +217,17 @@ class Setting:
             raise InputError(
                 f"scale {text!r} has more bins than the {self.bins} of the first; give those to it"
             )
+        fewer = self.bins if bins is None else bins
+        depth = self.volume_bins or fewer
+        is_short = depth < fewer
         return replace(
             self,
+            volume_bins=depth if is_short else None,
+            time_stride=min(self.time_stride, fewer - depth) if is_short else 1,
             patch=patch,
             stride=self.stride if stride is None else stride,
             downsample=1 if downsample is None else downsample,
-            bins=self.bins if bins is None else bins,
+            bins=fewer,
             scales="none",
         )
 

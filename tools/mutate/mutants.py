@@ -32,6 +32,7 @@ MARKING = "tests/test_kernels.py -k 'mark_dirty or update or settle'"
 INGEST = "tests/test_kernels.py -k 'count_event or advance_to_bin'"
 SESSION = "tests/test_session.py"
 SHARD = "tests/test_live_shard.py -k share"
+SHORT = "tests/test_volume_bins.py"
 RECORDING = "tests/test_recording.py"
 
 MUTANTS = [
@@ -49,6 +50,27 @@ MUTANTS = [
         "(volume == last and line_entry - c * stride < last_entry)",
         "volume == last",
         MARKED,
+    ),
+    Mutant(
+        "lines of a rectangle are counted along the wrong side",
+        "kernels/volume.py",
+        "        position = line // rows\n",
+        "        position = line // columns\n",
+        "tests/test_kernels.py -k 'every_case and gather_volume'",
+    ),
+    Mutant(
+        "an entry of a rectangle lies along the wrong side",
+        "kernels/change.py",
+        "((position - ahead) * height + row - top) * width + column - left",
+        "((position - ahead) * width + row - top) * height + column - left",
+        "tests/test_invariants.py -k 'however_it_is_fed'",
+    ),
+    Mutant(
+        "mark_dirty takes rectangles for squares",
+        "kernels/update.py",
+        "(position * rows + row - r * stride) * length + column",
+        "(position * length + row - r * stride) * length + column",
+        "tests/test_invariants.py -k 'however_it_is_fed'",
     ),
     Mutant(
         "the queue mixes cells",
@@ -204,6 +226,90 @@ MUTANTS = [
         "            state.atoms[np.arange(len(state.atoms)) != state.clock[CLOCK_PLANE]] = 0\n",
         "",
         "tests/test_state.py -k 'codes_of_a_snapshot_alone'",
+    ),
+    Mutant(
+        "rows of the sensor have the volumes of its columns",
+        "engine/state.py",
+        "_covering(geometry.sides[0], geometry.stride, ring[1], rows)",
+        "_covering(geometry.sides[1], geometry.stride, ring[1], rows)",
+        "tests/test_patches.py -k small_sensor",
+    ),
+    Mutant(
+        "a rectangle is the fingerprint of another",
+        "engine/geometry.py",
+        "sides[0] if sides[0] == sides[1] else sides)",
+        "sides[0] if sides[0] == sides[1] else tuple(sorted(sides)))",
+        "tests/test_patches.py -k 'differ_only or one_spelling'",
+    ),
+    Mutant(
+        "windows of small sensors are left out where the patch is as large as the sensor",
+        "learn/fit.py",
+        "limit=limit, padded=padded)",
+        "limit=limit)",
+        "tests/test_patches.py -k largest",
+    ),
+    Mutant(
+        "sums of a bin that is over stay after a belated event",
+        "engine/past.py",
+        "< number + self._geometry.depth)] = _NO_BIN",
+        "< number + 1)] = _NO_BIN",
+        SHORT,
+    ),
+    Mutant(
+        "what earlier bins are worth is added twice",
+        "engine/past.py",
+        "+= self._added - before",
+        "+= self._added",
+        SHORT,
+    ),
+    Mutant(
+        "sums of a bin are kept with those of the bins before",
+        "engine/past.py",
+        "sums - self._added_to(now), now",
+        "sums, now",
+        SHORT,
+    ),
+    Mutant(
+        "a bin is kept that was not brought up to date",
+        "engine/engine.py",
+        "                update_plane(self._operator, state, self._crew)\n                self._past",
+        "                self._past",
+        SHORT,
+    ),
+    Mutant(
+        "an event of an earlier bin is followed together with others",
+        "engine/past.py",
+        "            is_cut |= is_over\n",
+        "",
+        SHORT,
+    ),
+    Mutant(
+        "a trace counts the events that newest volumes see",
+        "engine/engine.py",
+        "            if self._past and len(run):",
+        "            if False:",
+        SHORT,
+    ),
+    Mutant(
+        "a snapshot goes on with sums that were found on the way",
+        "engine/engine.py",
+        "                self._past.forget()\n",
+        "                pass\n",
+        SHORT,
+    ),
+    Mutant(
+        "counts of one volume begin a bin later",
+        "engine/past.py",
+        "np.arange(number - self._geometry.depth + 1, number + 1)",
+        "np.arange(number - self._geometry.depth + 2, number + 2)",
+        SHORT,
+    ),
+    Mutant(
+        "volumes are learned from the oldest bins only",
+        "learn/volumes.py",
+        "bins = rng.integers(0, places.shape[0], tries) if places.shape[0] > 1 else np.zeros(tries, np.int64)",
+        "bins = np.zeros(tries, np.int64)",
+        SHORT,
     ),
     # stream
     Mutant(
