@@ -15,11 +15,11 @@ from streamfeat.stream.cameras import CameraLeft, Cameras
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.emission_stream import _QueueSink
 from streamfeat.stream.pipeline import Pipeline
-from streamfeat.stream.room import MEMORY, Room, usable_bytes
+from streamfeat.stream.room import MEMORY, Room, engine_bytes, usable_bytes
 from streamfeat.stream.session import Session
 
 MODEL = tiny.encoder(k=3)
-WEIGHT = Engine(MODEL, tiny.RESOLUTION).held_bytes
+WEIGHT = engine_bytes(Engine(MODEL, tiny.RESOLUTION))
 
 
 def packet(topic, resolution=tiny.RESOLUTION):

@@ -309,12 +309,6 @@ class Engine(Shown):
         """Volumes of the first scale encoded so far."""
         return int(self._state.encoded.sum()) + (self._past.encoded if self._past else 0)
 
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of its arrays; a system gives it their pages as they are first used."""
-        mine = sum(array.nbytes for array in self._state if isinstance(array, np.ndarray))
-        return mine + sum(scale.held_bytes for _, scale in self._further)
-
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
         events, late, rejected, saturated, rolls = (int(value) for value in self._window.tally)

@@ -18,7 +18,7 @@ from streamfeat.engine.engine import Engine
 from streamfeat.events import Resolution
 from streamfeat.files.budget import parse_bytes
 
-__all__ = ["MEMORY", "Room", "usable_bytes"]
+__all__ = ["MEMORY", "Room", "engine_bytes", "usable_bytes"]
 
 MEMORY = "STREAMFEAT_MEMORY"
 """Environment variable with the limit, such as `4G`; `streamfeat --memory 4G COMMAND` sets it."""
@@ -57,7 +57,7 @@ class Room:
     @property
     def held_bytes(self) -> int:
         """Of all engines."""
-        return sum(engine.held_bytes for engine in list(self._held))
+        return sum(engine_bytes(engine) for engine in list(self._held))
 
     def maker(self, topic: str, make: Callable[..., Engine]) -> Callable[..., Engine]:
         """A function that makes an engine of a camera as `make` does, if there is room for it.
@@ -70,11 +70,11 @@ class Room:
             self._refuse(topic, self._too_large.get(resolution, 0))
             engine = make(encoder, resolution, **options)
             try:
-                self._refuse(topic, engine.held_bytes)
+                self._refuse(topic, engine_bytes(engine))
             except MemoryError:
                 if len(self._too_large) >= _SIZES_KNOWN:
                     self._too_large.clear()
-                self._too_large[resolution] = engine.held_bytes
+                self._too_large[resolution] = engine_bytes(engine)
                 raise
             self._held[engine] = topic
             return engine
@@ -82,13 +82,19 @@ class Room:
         return weighed
 
     def _refuse(self, topic: str, mine: int) -> None:
-        others = sum(one.held_bytes for one, of in list(self._held.items()) if of != topic)
+        others = sum(engine_bytes(one) for one, of in list(self._held.items()) if of != topic)
         if others + mine > self._most:
             raise MemoryError(
                 f"its engine of {_mega(mine)} and the {_mega(others)} of others are more than the "
                 f"{_mega(self._most)} that they may have; `streamfeat --memory BYTES COMMAND` allows more, a "
                 "model with a larger stride or downsample needs less"
             )
+
+
+def engine_bytes(engine: Engine) -> int:
+    """Bytes of an engine's arrays, those of all scales; a system gives it their pages as they are used."""
+    mine = sum(array.nbytes for array in engine._state)
+    return mine + sum(engine_bytes(scale) for _, scale in engine._further)
 
 
 def _mega(n_bytes: int) -> str:
