@@ -1,9 +1,19 @@
-"""`python -m streamfeat`: the command line.
+"""`python -m streamfeat` and `streamfeat`: the command line.
 
-Lives here: the call alone. Not here: commands (`cli`).
+Lives here: the call alone, and that an interrupt is heard before anything else is loaded. Not here: commands
+(`cli`).
 """
 
-from streamfeat.cli import main
+from streamfeat.work import interrupts
+
+
+def main() -> None:
+    """Run the command line."""
+    interrupts.start()
+    from streamfeat.cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -5,6 +5,7 @@ import stat
 import subprocess
 import sys
 import threading
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -226,3 +227,53 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     command = [sys.executable, "-W", "ignore", "-c", program, str(ROOT), str(ROOT / "tests")]
     assert subprocess.run(command, check=False, timeout=300).returncode == 0
+
+
+# --- folders of others
+
+
+def sample_file(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    events = tiny.stream(range(100))
+    np.savez(path, **{name: events[name] for name in "xypt"})
+
+
+@pytest.mark.parametrize("scheme", ["", "file://", "zip://data::file://"])
+def test_names_with_two_colons_are_samples_as_any(scheme, tmp_path, run):
+    """A URL has no way to say them: two colons begin what a store is kept in."""
+    pytest.importorskip("fsspec", reason="the extra `store` is not installed")
+    for name in ("a::b/0.npz", "c/one::two.npz", "c/plain.npz"):
+        sample_file(tmp_path / "data" / name)
+    with zipfile.ZipFile(tmp_path / "data.zip", "w") as archive:
+        for path in sorted((tmp_path / "data").rglob("*.npz")):
+            archive.write(path, path.relative_to(tmp_path))
+    source = f"{tmp_path}/data.zip" if "zip" in scheme else f"{tmp_path}/data"
+    result = run("convert", f"{scheme}{source}", tmp_path / "out.mcap", "--json")
+    assert (result.status, result.json["samples"], result.json["failed"]) == (0, 3, 0)
+    with open_recording(tmp_path / "out.mcap") as recording:
+        assert [label.label for label in recording.labels] == ["a::b", "c", "c"]
+
+
+def test_a_class_folder_that_is_a_link_to_nothing_is_listed(tmp_path, run):
+    for name in ("train/a/0.npz", "train/b/0.npz"):
+        sample_file(tmp_path / "data" / name)
+    (tmp_path / "data/train/c").symlink_to(tmp_path / "gone")
+    (tmp_path / "data/other").symlink_to(tmp_path / "gone")
+    result = run("convert", tmp_path / "data", tmp_path / "out.mcap", "--json")
+    assert (result.status, result.json["samples"], result.json["failed"]) == (1, 2, 2)
+    assert all(f"/{name}'" in str(result.json["faults"]) for name in ("other", "train/c"))
+
+
+def test_a_folder_that_another_user_keeps_to_himself_is_one_line(tmp_path, run, monkeypatch):
+    """Whatever asks first; root may enter all, so the system is made to refuse."""
+    real = os.stat
+
+    def stat_of(path, *arguments, **options):
+        if str(path).startswith("/closed"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "stat", stat_of)
+    result = run("record", "a/*", "-o", "/closed/out.mcap")
+    assert (result.status, result.out) == (2, "")
+    assert result.err == "error: /closed/out.mcap: Permission denied; may this user read and enter it?\n"

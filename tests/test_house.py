@@ -64,6 +64,7 @@ ROOMS = {
         "messages",
         "recordings",
         "shipped",
+        "work",
     },
     "evaluate": ALL_ABOVE,
     "latency": ALL_ABOVE,

@@ -73,6 +73,10 @@ ROWS = {
     "the task of a pipeline is cancelled": [
         "test_pipeline.py::test_cancelling_the_task_closes_sinks_as_failed"
     ],
+    "Ctrl-C or SIGTERM, anywhere": [
+        "test_interrupts.py::test_a_command_ends_though_its_main_thread_is_busy",
+        f"{THIS_PROCESS}::test_an_interrupt_while_libraries_are_loaded_or_kernels_compiled_is_heard",
+    ],
     "Ctrl-C or SIGTERM, streams": [
         "test_cli.py::test_an_interrupted_replay_keeps_what_it_read",
         "test_live_cli.py::test_listen_ends_well_when_interrupted",
@@ -236,16 +240,18 @@ def test_a_signal_before_anything_runs_waits_until_it_can_be_heard(tmp_path):
         signal.raise_signal(signal.SIGINT)
 
 
-CODE = "from streamfeat.cli import main; main()"
+HEARD_S = 2
+"""Within a second, on a machine that does nothing else."""
 
 
 @contextmanager
-def started(*words):
+def started(*words, **environment):
     process = subprocess.Popen(
-        [sys.executable, "-W", "error", "-c", CODE, *map(str, words)],
+        [sys.executable, "-W", "error", "-m", "streamfeat", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env=os.environ | environment,
     )
     try:
         yield process
@@ -277,14 +283,32 @@ def test_a_replay_ends_on_sigterm_as_on_ctrl_c(home, tmp_path):
     with started(*words, "--json") as process:
         wait_for((tmp_path / "out.jsonl.part").exists, process)
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=HEARD_S)
     assert (process.returncode, err) == (130, "")
     assert json.loads(out)["interrupted"] is True
     assert list(tmp_path.iterdir()) == [target]
 
 
-LONG = ["--patch", 8, "--filters", 200, "--volumes", 8000, "--lambda0", 0.1, "--iterations", 10**9]
-"""More than a hundred iterations of a fifth of a second, with the digits that ship."""
+LONG = ["--patch", 8, "--filters", 200, "--volumes", 4000, "--lambda0", 0.1, "--iterations", 10**9]
+"""More than a hundred iterations of a tenth of a second, with the digits that ship."""
+
+
+@pytest.mark.real_time
+def test_an_interrupt_while_libraries_are_loaded_or_kernels_compiled_is_heard(home, tmp_path):
+    words = ["replay", home / "few.mcap", "-m", home / "model", "-o", tmp_path / "out.mcap"]
+    caches = tmp_path / "caches"
+    with started(*words, NUMBA_CACHE_DIR=str(caches)) as loading:
+        time.sleep(0.3)
+        loading.send_signal(signal.SIGINT)
+        assert loading.communicate(timeout=HEARD_S) == ("", "")
+        assert loading.returncode == 130
+    with started(*words, NUMBA_CACHE_DIR=str(caches)) as compiling:
+        assert compiling.stderr.readline().startswith("compiling: kernels")
+        compiling.send_signal(signal.SIGHUP)
+        out, err = compiling.communicate(timeout=HEARD_S)
+        assert (compiling.returncode, out) == (130, "")
+        assert "Traceback" not in err
+    assert not [*tmp_path.glob("out*")]
 
 
 @pytest.mark.real_time
@@ -304,7 +328,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(command, home, tmp_path):
     with started(command, *words) as process:
         wait_for((tmp_path / "out.part").exists, process)
         process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=HEARD_S)
     assert "Traceback" not in err
     assert process.returncode == 130
     assert [path.name for path in tmp_path.iterdir()] == (["out"] if command == "learn" else [])

@@ -7,11 +7,9 @@ Not here: anything another program might want to call. Commands import what they
 
 import errno
 import os
-import signal
 import sys
 from contextlib import suppress
 from io import TextIOWrapper
-from types import FrameType
 from typing import Any, NoReturn
 
 import typer
@@ -31,7 +29,9 @@ from streamfeat.cli import (
 )
 from streamfeat.cli.blas import spare_blas
 from streamfeat.cli.program import app, err
-from streamfeat.errors import InputError
+from streamfeat.errors import InputError, printable
+from streamfeat.files.outputs import remove_unfinished
+from streamfeat.work import interrupts
 
 __all__ = [
     "app",
@@ -58,10 +58,11 @@ _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG}
 def main() -> NoReturn:
     """Run the command line; what the user can mend ends with one line and exit status 2.
 
-    SIGTERM ends a command as Ctrl-C does: with what is done written, and nothing half written. Where nobody
-    reads standard output any more, as behind `| head`, a command ends silently with 1.
+    SIGTERM and SIGHUP end a command as Ctrl-C does: with what is done written, and nothing half written.
+    Where nobody reads standard output any more, as behind `| head`, a command ends silently with 1.
     """
-    signal.signal(signal.SIGTERM, _interrupt)
+    interrupts.at_leaving(remove_unfinished)
+    interrupts.hear()
     spare_blas()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # where the encoding lacks a letter, its number is shown
@@ -79,7 +80,7 @@ def main() -> NoReturn:
         _drop_output()
         err.print(f"[bold red]error:[/] standard output cannot be written: {error.strerror}")
         status = 2
-    sys.exit(status)
+    interrupts.end(status)
 
 
 def _run() -> int:
@@ -95,9 +96,17 @@ def _run() -> int:
     except MemoryError as error:
         err.print(f"[bold red]error:[/] out of memory, ask for less: {escape(str(error))}", soft_wrap=True)
         return 2
+    except PermissionError as error:  # somewhere in the path of an input or output
+        err.print(f"[bold red]error:[/] {escape(printable(_denied(error)))}", soft_wrap=True)
+        return 2
     except KeyboardInterrupt:
-        return 130
+        return interrupts.INTERRUPTED
     return status if isinstance(status, int) else 0
+
+
+def _denied(error: PermissionError) -> str:
+    """Which path another user keeps from this one."""
+    return f"{os.fsdecode(error.filename or 'something')}: {error.strerror}; may this user read and enter it?"
 
 
 def _drop_output() -> None:
@@ -118,7 +127,3 @@ def _tell(error: Any) -> None:
     if error.ctx:
         line += f" (`{error.ctx.command_path} -h` says more)"
     err.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

@@ -34,6 +34,7 @@ from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.cli.tables import print_table
 from streamfeat.errors import InputError
+from streamfeat.work import interrupts
 
 if TYPE_CHECKING:
     from streamfeat.recordings.options import ReadOptions
@@ -180,6 +181,12 @@ def evaluate(
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
     parsed = [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
+    how = (
+        f"the same command goes on from {state_path(output)}: {_this_command()}"
+        if output
+        else "give -o RESULT.json, and the same command goes on where it was interrupted"
+    )
+    interrupts.last_words(f"interrupted; {how}")
     try:
         with (
             working(cluster, workers, quiet=quiet) as place,
@@ -202,12 +209,7 @@ def evaluate(
                 finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
-        how = (
-            f"the same command goes on from {state_path(output)}: {_this_command()}"
-            if output
-            else "give -o RESULT.json, and the same command goes on where it was interrupted"
-        )
-        err.print(f"[yellow]interrupted;[/] {escape(how)}", soft_wrap=True)
+        err.print(f"[yellow]{escape(interrupts.take_last_words())}[/]", soft_wrap=True)
         raise typer.Exit(130) from None
     if page:
         write_page(page, result)

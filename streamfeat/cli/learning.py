@@ -37,6 +37,7 @@ from streamfeat.cli.program import (
 from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, print_removed, reads_recordings
 from streamfeat.errors import InputError
+from streamfeat.work import interrupts
 
 if TYPE_CHECKING:
     from streamfeat.engine.encoder import Encoder
@@ -117,6 +118,7 @@ def learn(
     setting = Setting(**options.setting_given(context))
     before = Encoder.load(resume) if resume else None
     part = model.with_name(model.name + ".part")
+    interrupts.last_words("interrupted before an iteration was done; nothing was written")
     try:
         with contextlib.ExitStack() as files:
             opened = [files.enter_context(open_recording(path, topic, reading)) for path in recordings]
@@ -130,7 +132,7 @@ def learn(
                 opened, setting, resume=before, report=report, keep=_keeper(part), workers=place
             )
     except KeyboardInterrupt:
-        err.print("[yellow]interrupted[/] before an iteration was done; nothing was written", soft_wrap=True)
+        err.print(f"[yellow]{escape(interrupts.take_last_words())}[/]", soft_wrap=True)
         raise typer.Exit(130) from None
     encoder.save(model)
     part.unlink(missing_ok=True)

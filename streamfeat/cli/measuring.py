@@ -4,11 +4,8 @@ Lives here: their arguments, and how their results are shown.
 Not here: the measurements (`latency`).
 """
 
-import contextlib
-import signal
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
+from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -34,6 +31,7 @@ from streamfeat.cli.program import (
 from streamfeat.cli.progress import progress_bars
 from streamfeat.cli.reading import print_assumptions, reads_recordings
 from streamfeat.cli.tables import print_table
+from streamfeat.work import interrupts
 
 if TYPE_CHECKING:
     from streamfeat.latency.measure import LatencyReport
@@ -127,9 +125,10 @@ def latency(
             progress("compiling", 0, 0, "not counted")
             report.compile()
             progress("compiling", 1, 1, "")
-            with _stopped_by_interrupt() as stopped:
-                report.run(progress, stopped)
-    except KeyboardInterrupt:  # before there is anything to show, or for the second time
+            stopped = Event()
+            with interrupts.kept_by(stopped.set):
+                report.run(progress, stopped.is_set)
+    except KeyboardInterrupt:  # before there is anything to show
         raise typer.Exit(130) from None
     if as_json:
         print_json("latency", report.result())
@@ -156,20 +155,3 @@ def _print(report: "LatencyReport") -> None:
             "machines; the tails are theirs too",
             soft_wrap=True,
         )
-
-
-@contextlib.contextmanager
-def _stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
-    """A function that says whether SIGINT has come. A second one interrupts as usual."""
-    came = False
-
-    def note(number: int, frame: FrameType | None) -> None:
-        nonlocal came
-        came = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: came
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -114,11 +114,24 @@ def _options(
             help="Let a file unpack to so much, such as 4G, where that is over 64M and 200 times the file.",
         ),
     ] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BYTES",
+            help="Let engines of all cameras hold so much, such as 4G.",
+            show_default="half of the memory",
+        ),
+    ] = None,
 ) -> None:
+    # Processes that this one starts have them, too.
     if unpack is not None:
         from streamfeat.files.budget import VARIABLE, parse_bytes
 
-        os.environ[VARIABLE] = str(parse_bytes(unpack))  # which processes that this one starts have, too
+        os.environ[VARIABLE] = str(parse_bytes(unpack))
+    if memory is not None:
+        from streamfeat.files.budget import parse_bytes
+
+        os.environ["STREAMFEAT_MEMORY"] = str(parse_bytes(memory, "--memory"))
 
 
 def _tell_version(asked: bool) -> None:

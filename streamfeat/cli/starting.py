@@ -23,6 +23,7 @@ from streamfeat.cli.program import (
 )
 from streamfeat.cli.progress import progress_bars
 from streamfeat.errors import InputError
+from streamfeat.work import interrupts
 
 __all__ = ["demo", "doctor"]
 
@@ -51,6 +52,7 @@ def demo(
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror}; give another --folder") from error
     started = time.monotonic()
+    interrupts.last_words(f"interrupted; {folder} holds what was done")
     try:
         with progress_bars(quiet=quiet) as report:
             job = Demo(folder, report)
@@ -61,8 +63,8 @@ def demo(
             classifier = job.fit(encoder)
         replayed = job.replay(encoder, classifier, None if quiet or as_json else out)
     except KeyboardInterrupt:
-        err.print(f"[yellow]interrupted[/]; {escape(str(folder))} holds what was done", soft_wrap=True)
-        raise typer.Exit(130) from None
+        err.print(f"[yellow]{escape(interrupts.take_last_words())}[/]", soft_wrap=True)
+        raise typer.Exit(interrupts.INTERRUPTED) from None
     result = {
         "written": str(folder),
         "simulated": simulated,

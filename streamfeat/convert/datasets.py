@@ -112,7 +112,8 @@ def find_samples(folder: str | Path | StoreLocation, endings: tuple[str, ...] = 
     A sample is a file of a known kind; its label is the name of the folder it is in. The nearest folder above
     the label whose name ends in train, test, validation or a usual variant (`Train`, `n-cars_test`) gives the
     split; `folder` itself counts. Hidden files, folders of annotations, and files without a label are passed
-    over. A rosbag2 folder, known by its `metadata.yaml`, is one sample.
+    over. A rosbag2 folder, known by its `metadata.yaml`, is one sample, and so is a link that leads nowhere:
+    it cannot be read, and is listed.
 
     Args:
         folder: or its URL.
@@ -134,13 +135,14 @@ def find_samples(folder: str | Path | StoreLocation, endings: tuple[str, ...] = 
     for path, source in _outside_bags(files, bags):
         *above, _ = parts = source.split("/")
         hidden = any(part.startswith(".") or part.endswith("_annotations") for part in parts)
-        is_sample = source in bags or path.name.lower().endswith(endings)
-        if hidden or not is_sample or not above:
+        leads_nowhere = isinstance(path, Path) and not path.exists()  # it may have been a folder
+        is_sample = source in bags or path.name.lower().endswith(endings) or leads_nowhere
+        if hidden or not is_sample or not (above or leads_nowhere):
             continue
-        if len(above) == 1 and split_named(above[0]):
+        if len(above) == 1 and split_named(above[0]) and not leads_nowhere:
             continue  # a file right inside a split has no label
         split = next(filter(None, map(split_named, [*above[-2::-1], name])), "")
-        samples.append(SamplePath(path, above[-1], split, source))
+        samples.append(SamplePath(path, above[-1] if above else path.name, split, source))
     if not samples:
         raise InputError(
             f"{folder}: holds no samples; expected LABEL/FILE or SPLIT/LABEL/FILE with files ending in "
@@ -156,10 +158,16 @@ def _outside_bags(files: Iterable[tuple[Location, str]], bags: set[str]) -> Iter
         if inside not in bags:
             yield path, source
         elif name == METADATA:
-            here = (
-                path.parent if isinstance(path, Path) else StoreLocation(path.url.replace(f"/{name}", "", 1))
-            )
-            yield here, inside
+            yield _folder_of(path, name), inside
+
+
+def _folder_of(path: Location, name: str) -> Location:
+    """The folder of a file of this name."""
+    if isinstance(path, Path):
+        return path.parent
+    if path.inside:
+        return replace(path, inside=path.inside.removesuffix(f"/{name}"))
+    return StoreLocation(path.url.replace(f"/{name}", "", 1))
 
 
 def _files(folder: Location) -> Iterable[tuple[Location, str]]:

@@ -21,9 +21,13 @@ __all__ = [
     "open_file_of",
     "refuse_input",
     "sweep",
+    "unfinished",
     "unwritable",
     "write_atomically",
 ]
+
+unfinished: set[Path] = set()
+"""Files of this process that are being written and have no name yet."""
 
 _SUFFIX = ".tmp"
 _MOST_LINKS = 40
@@ -125,12 +129,14 @@ def _replacing(path: Path, target: Path, private: bool) -> Iterator[Path]:
         raise InputError(f"{path}: cannot write there: {error.strerror}") from error
     os.close(handle)
     temporary = Path(name)
+    unfinished.add(temporary)
     try:
         yield temporary
         temporary.chmod(0o600 if private else 0o666 & ~_umask())
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+        unfinished.discard(temporary)
 
 
 def _umask() -> int:

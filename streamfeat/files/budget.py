@@ -59,8 +59,8 @@ class Budget:
         self._used += n_bytes
 
 
-def parse_bytes(text: str) -> int:
-    """Read a number of bytes such as `4G`, `500M` or `1000`.
+def parse_bytes(text: str, option: str = "--unpack") -> int:
+    """Read a number of bytes such as `4G`, `500M` or `1000`, the value of an option.
 
     Raises:
         InputError: it is something else.
@@ -69,5 +69,5 @@ def parse_bytes(text: str) -> int:
     if number[-1:] in ("K", "M", "G"):
         number, unit = number[:-1], number[-1]
     if not (number.isascii() and number.isdecimal() and len(number) < 12):
-        raise InputError(f"--unpack {text}: give a number of bytes, such as 500M or 4G")
+        raise InputError(f"{option} {text}: give a number of bytes, such as 500M or 4G")
     return int(number) << _UNITS[unit]

@@ -53,13 +53,18 @@ class StoreLocation:
 
     It is small, can be pickled, and holds nothing open. As text it has no user, no password and no query of
     a web address, where signatures are.
+
+    Attributes:
+        url: of the file, or of a folder that it is in.
+        inside: its path in that folder, where its name holds `::`, which a URL has no way to say.
     """
 
     url: str
+    inside: str = ""
 
     def __str__(self) -> str:
         """The URL as it may be shown."""
-        return _shown(self.url)
+        return _shown(self.url) + (f"/{self.inside}" if self.inside else "")
 
     def __repr__(self) -> str:
         """As it may be shown, too: tracebacks and logs print this."""
@@ -68,6 +73,8 @@ class StoreLocation:
     @property
     def name(self) -> str:
         """The part after the last slash."""
+        if self.inside:
+            return self.inside.rpartition("/")[2]
         # The first of a chain that has a path is what is read; those behind it are where it is kept.
         first = next(part for part in self.url.split("::") if "://" in part)
         path = first.partition("://")[2]
@@ -159,10 +166,13 @@ def files_below(folder: StoreLocation) -> list[tuple[StoreLocation, str]]:
     # The folder is in the first of a chain that has a path; what is below it goes there.
     before, separator, rest = folder.url.partition("://")
     there, *others = rest.split("::")
-    return [
-        (StoreLocation("::".join([f"{before}{separator}{there.rstrip('/')}/{name}", *others])), name)
-        for name in names
-    ]
+
+    def place(name: str) -> StoreLocation:
+        if "::" in name:
+            return StoreLocation(folder.url, name)
+        return StoreLocation("::".join([f"{before}{separator}{there.rstrip('/')}/{name}", *others]))
+
+    return [(place(name), name) for name in names]
 
 
 @contextmanager
@@ -190,7 +200,7 @@ def _system_of(location: StoreLocation) -> tuple[Any, Any]:
     from fsspec.core import url_to_fs
 
     system, path = url_to_fs(location.url)
-    return system, path
+    return system, f"{str(path).rstrip('/')}/{location.inside}" if location.inside else path
 
 
 class _StoredFile(io.BufferedIOBase):

@@ -9,19 +9,23 @@ import errno
 import io
 import os
 import time
+import weakref
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self, cast
 
 from streamfeat.errors import InputError
-from streamfeat.files.atomic import followed, is_replaced, open_file_of
+from streamfeat.files.atomic import followed, is_replaced, open_file_of, unfinished
 
 try:
     import fcntl
 except ImportError:  # a system without locks of this kind: two writers of one output are not told
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["OutputFile", "locked_file"]
+__all__ = ["OutputFile", "locked_file", "remove_unfinished"]
+
+_outputs: "weakref.WeakSet[OutputFile]" = weakref.WeakSet()
+"""Of this process, whose parts are removed when it leaves in haste."""
 
 _WAIT_S, _TURN_S = 10, 0.02
 _FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
@@ -45,7 +49,13 @@ class OutputFile:
     """
 
     def __init__(
-        self, path: Path, *, suffix: str = ".part", keep_leftover: bool = False, private: bool = False
+        self,
+        path: Path,
+        *,
+        suffix: str = ".part",
+        keep_leftover: bool = False,
+        private: bool = False,
+        outlives: bool = False,
     ) -> None:
         """Open and lock the part.
 
@@ -55,6 +65,7 @@ class OutputFile:
             keep_leftover: refuse to begin where a writer that was killed has left a part with something in
                 it; it is overwritten otherwise.
             private: for this user's eyes alone, where a new file otherwise has the permissions of any other.
+            outlives: `remove_unfinished` leaves the part, from which much can be saved.
 
         Raises:
             InputError: it is a folder or a link to nothing, its folder is not there, another writer is at
@@ -79,6 +90,8 @@ class OutputFile:
             )
         if self.part:
             self.file.truncate(0)
+            if not outlives:
+                _outputs.add(self)
 
     def __enter__(self) -> Self:
         """Give the output itself."""
@@ -120,6 +133,14 @@ class OutputFile:
             self.file.close()
         with contextlib.suppress(OSError):  # a second time closes what the first could not flush
             self.file.close()
+
+
+def remove_unfinished() -> None:
+    """Remove what is being written and not whole; for a process that ends with its next instruction."""
+    parts = [output.part for output in list(_outputs) if output.part and not output.file.closed]
+    for path in [*parts, *unfinished]:
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def locked_file(path: Path, output: Path | None = None, *, private: bool = False) -> BinaryIO:

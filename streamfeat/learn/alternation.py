@@ -6,7 +6,6 @@ Not here: the half-steps themselves (`transform`, `dictionary`).
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -18,6 +17,7 @@ from streamfeat.errors import InputError
 from streamfeat.learn.chunks import ChunkedVolumes, checked_volumes
 from streamfeat.learn.initial import STARTS, check_usable, random_directions, spherical_means
 from streamfeat.learn.omega import condition_number, mutual_coherence
+from streamfeat.work.interrupts import aside, promised
 from streamfeat.work.workers import one_blas_thread
 
 __all__ = ["Alternation", "Step"]
@@ -85,8 +85,9 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         coherence: list[float] = []
         self.interrupted_ = False
         self._keep(rows, objective, condition, coherence)
+        steps = self._alternate(volumes, squares, rows)
         try:
-            for step in islice(self._alternate(volumes, squares, rows), self.max_iter):
+            for step in self._interruptible(steps):
                 shown = condition_number(step.rows), mutual_coherence(step.rows)
                 objective += [step.after_codes, step.after_rows]
                 condition.append(shown[0])
@@ -100,6 +101,13 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         except KeyboardInterrupt:
             self.interrupted_ = True
         return self
+
+    def _interruptible(self, steps: Iterator[Step]) -> Iterator[Step]:
+        """The steps; from the second on, Ctrl-C comes within a step, and the one before is kept."""
+        yield aside(next, steps)
+        with promised():
+            for _ in range(1, self.max_iter):
+                yield aside(next, steps)
 
     def _keep(
         self,

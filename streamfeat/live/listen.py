@@ -41,6 +41,7 @@ from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline, Processor
+from streamfeat.stream.room import Room
 from streamfeat.stream.session import Session, StreamItem
 from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import RecordingSink, Sink
@@ -131,6 +132,7 @@ class ListenJob:
         self._names, self._shard, self._announced = names, shard, announced
         self._learn_online, self._network, self._publish = learn_online, network, publish
         self._engine_of, self._tap, self._threads = engine_of, tap, usable_threads(threads)
+        self._room = Room()
         self._patience_ns = patience_s * 1e9
         self.interrupted, self._keep_features = False, True
         self._warnings = Warnings.on(console)
@@ -242,7 +244,7 @@ class ListenJob:
             clock=time.perf_counter,
             topic=topic,
             is_behind=self._is_behind,
-            engine=self._engine_of(topic),
+            engine=self._room.maker(topic, self._engine_of(topic)),
             denoising=self._denoising,
             load=Load(self._encoder.geometry, lambda line: self._warnings.add("too much work", topic, line)),
             keep_features=self._keep_features,

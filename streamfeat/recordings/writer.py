@@ -133,7 +133,9 @@ class RecordingWriter:
         self._reached_us: int | None = None
         self._ahead_us = 0
         self._check_target()
-        self._output = OutputFile(self.path, suffix=part_suffix, keep_leftover=True, private=private)
+        self._output = OutputFile(
+            self.path, suffix=part_suffix, keep_leftover=True, private=private, outlives=keep_partial
+        )
         self._writer = Writer(self._output.file, chunk_size=chunk_size, compression=_COMPRESSION[compression])
         self._writer.start(profile="ros2", library="streamfeat")
 

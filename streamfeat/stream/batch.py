@@ -72,6 +72,11 @@ class EmissionBatch(Sequence[Emission]):
         """Number of emissions."""
         return len(self.t_us)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays."""
+        return sum(getattr(self, name).nbytes for name in _COLUMNS)
+
     @overload
     def __getitem__(self, index: int) -> Emission: ...
 

@@ -33,6 +33,7 @@ from streamfeat.kernels import cache
 from streamfeat.kernels.decode import place_events
 from streamfeat.kernels.ingest import count_events
 from streamfeat.kernels.update import mark_dirty, read, renew, settle
+from streamfeat.work.interrupts import at_leaving
 
 __all__ = ["Compilers", "compile_together", "is_compiled"]
 
@@ -87,6 +88,9 @@ class Compilers:
             codes.stdout.close()  # the other process holds its end
         except OSError:  # no room for a process: kernels are compiled where they are needed
             self.close()
+        except BaseException:
+            self.close()
+            raise
 
     def _start(self, half: str, stdin: object = None, stdout: object = None) -> "subprocess.Popen[bytes]":
         command = [sys.executable, "-P", "-m", __name__, half, "narrow" if self._narrow else "wide"]
@@ -100,6 +104,7 @@ class Compilers:
             start_new_session=True,
         )
         self._started.append(started)
+        at_leaving(started.kill)
         return started  # type: ignore[no-any-return]
 
     def __enter__(self) -> Self:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission
 from streamfeat.stream.pipeline import Pipeline, PipelineStats
 from streamfeat.stream.sinks import Sink
@@ -31,9 +32,9 @@ from streamfeat.stream.threads import Threads, finished
 
 __all__ = ["EmissionStream", "Job", "StreamStats"]
 
-_WAITING = 512
-"""Emissions that wait for the program at most: 6.5 MB at 3,200 features, and more than two parts of a
-pipeline.
+_WAITING, _WAITING_BYTES = 512, 64 << 20
+"""Emissions that wait for the program at most, more than two parts of a pipeline; and their bytes, or those
+of a single batch.
 """
 
 
@@ -211,6 +212,7 @@ class _QueueSink:
 
     def __init__(self) -> None:
         self._items: deque[Emission] = deque()
+        self._bytes = 0
         self._changed = threading.Condition()
         self._is_abandoned = self._has_ended = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -226,13 +228,19 @@ class _QueueSink:
 
     def write(self, emissions: Sequence[Emission]) -> None:
         """Add emissions as soon as there is room, or none once the queue is abandoned."""
+        weight = emissions.nbytes if isinstance(emissions, EmissionBatch) else 0
+
+        def has_room() -> bool:
+            if len(self._items) + len(emissions) > _WAITING:
+                return False
+            return not self._items or self._bytes + weight <= _WAITING_BYTES
+
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._is_abandoned or len(self._items) + len(emissions) <= _WAITING
-            )
+            self._changed.wait_for(lambda: self._is_abandoned or has_room())
             if self._is_abandoned:
                 return
             self._items += emissions
+            self._bytes += weight
             self.peak = max(self.peak, len(self._items))
         if self._loop:
             with suppress(RuntimeError):  # the loop is closed: its program is gone
@@ -261,6 +269,7 @@ class _QueueSink:
             with self._changed:
                 taken = list(self._items)
                 self._items.clear()
+                self._bytes = 0
                 self._changed.notify_all()
             if taken or self._has_ended:
                 return taken

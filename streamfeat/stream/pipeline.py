@@ -5,10 +5,10 @@ Not here: what is computed (`session`, `cameras`), read (`recordings`, `live`) o
 groups (`pacing`), threads (`threads`), signals (`signals`).
 
 Three tasks (`_Stages`): one reads and decodes, one runs the kernels, one writes. Blocking work happens in a
-thread of each task's own; kernels and decoders release the GIL. Both queues are bounded: when one is full,
-the task that fills it waits, so a replay loses nothing and needs no more memory than a few packets. A live
-source cannot make a camera wait: it has an inbox of its own, which says what happens when it is full
-(`live.inbox`).
+thread of each task's own; kernels and decoders release the GIL. Both queues are bounded, that of emissions by
+their bytes, too: when one is full, the task that fills it waits, so a replay loses nothing and needs no more
+memory than a few packets. A live source cannot make a camera wait: it has an inbox of its own, which says
+what happens when it is full (`live.inbox`).
 
 A live source also says when nothing more is there. If nothing is under way either, the thread that reads also
 processes and writes (`_Bypass`): no other thread has anything to do meanwhile, and each hop between
@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
+from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.pacing import Group, In, Pace, groups_of, stream_time
 from streamfeat.stream.sinks import Sink
 from streamfeat.stream.threads import Threads
@@ -36,7 +37,9 @@ Taken = TypeVar("Taken", contravariant=True)
 Made = TypeVar("Made", covariant=True)
 
 _QUEUE_ITEMS = 8
-_EMISSIONS_A_HOP = 256
+_EMISSIONS_A_HOP, _BYTES_A_HOP = 256, 4 << 20
+_MOST_OUT_BYTES = 64 << 20
+"""Of emissions under way to the sinks, or a single part: features of one emission may have megabytes."""
 
 
 @dataclass(slots=True)
@@ -159,6 +162,8 @@ class _Traffic(Generic[In, Out]):
     Attributes:
         inbox: groups of items for the processor; None ends it.
         outbox: batches of emissions for the sinks; None ends it.
+        out_bytes: of emissions that wait for the sinks or are being written.
+        lighter: set when there are fewer of these.
         stop: set to end the source.
         under_way: groups and parts that were handed on and are not done with.
         items: items read.
@@ -169,10 +174,28 @@ class _Traffic(Generic[In, Out]):
     outbox: asyncio.Queue[list[Sequence[Out]] | None] = field(
         default_factory=lambda: asyncio.Queue(_QUEUE_ITEMS)
     )
+    out_bytes: int = 0
+    lighter: asyncio.Event = field(default_factory=asyncio.Event)
     stop: asyncio.Event = field(default_factory=asyncio.Event)
     under_way: int = 0
     items: int = 0
     stopped: bool = False
+
+    async def hand_out(self, part: list[Sequence[Out]]) -> None:
+        """Give the sinks a part, as soon as all that they have is light enough."""
+        weight = _weight(part)
+        while self.out_bytes and self.out_bytes + weight > _MOST_OUT_BYTES:
+            self.lighter.clear()
+            await self.lighter.wait()
+        self.out_bytes += weight
+        self.under_way += 1
+        await self.outbox.put(part)
+
+    def written(self, part: list[Sequence[Out]]) -> None:
+        """A part is done with."""
+        self.out_bytes -= _weight(part)
+        self.under_way -= 1
+        self.lighter.set()
 
     def stats(self) -> PipelineStats:
         return PipelineStats(self.items, self.inbox.qsize(), self.outbox.qsize(), 0, self.stopped)
@@ -238,8 +261,7 @@ class _Stages(_Connected[In, Out]):
             while more_batches:
                 part, more_batches = await self._threads.run(_take, batches)
                 if part:
-                    traffic.under_way += 1
-                    await traffic.outbox.put(part)
+                    await traffic.hand_out(part)
             traffic.under_way -= 1
         await traffic.outbox.put(None)
 
@@ -247,7 +269,7 @@ class _Stages(_Connected[In, Out]):
         while (part := await self._traffic.outbox.get()) is not None:
             for sink in self._sinks:
                 await self._threads.run(_write, sink, part)
-            self._traffic.under_way -= 1
+            self._traffic.written(part)
 
 
 class _Bypass(_Connected[In, Out]):
@@ -282,13 +304,19 @@ def _batches(processor: Processor[In, Out], group: list[In] | None) -> Iterator[
 def _take(batches: Iterator[Sequence[Out]]) -> tuple[list[Sequence[Out]], bool]:
     """The next batches, as many as are worth a hop to another thread, and whether there may be more."""
     taken: list[Sequence[Out]] = []
-    n = 0
+    n = weight = 0
     for batch in batches:
         taken.append(batch)
         n += len(batch)
-        if n >= _EMISSIONS_A_HOP:
+        weight += _weight([batch])
+        if n >= _EMISSIONS_A_HOP or weight >= _BYTES_A_HOP:
             return taken, True
     return taken, False
+
+
+def _weight(part: list[Sequence[Out]]) -> int:
+    """Bytes of emissions; what is none weighs nothing."""
+    return sum(batch.nbytes for batch in part if isinstance(batch, EmissionBatch))
 
 
 def _write(sink: Sink[Out], batches: list[Sequence[Out]]) -> None:

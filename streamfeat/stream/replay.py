@@ -24,6 +24,7 @@ from streamfeat.stream.load import Load
 from streamfeat.stream.models import ClassifierSource, ModelSource, open_models
 from streamfeat.stream.outputs import NO_OUTPUTS, Outputs
 from streamfeat.stream.pipeline import Pipeline
+from streamfeat.stream.room import Room
 from streamfeat.stream.session import Session
 from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import Sink
@@ -103,7 +104,7 @@ class ReplayJob:
             reader,
             learn_online=learn_online,
             clock=time.perf_counter,
-            engine=engine,
+            engine=Room().maker("", engine),
             load=Load(self._encoder.geometry, self.advice.append),
             threads=usable_threads(threads),
         )

@@ -1,27 +1,25 @@
-"""SIGINT and SIGTERM for programs that run pipelines and nothing else.
+"""Interrupts of programs that run pipelines and nothing else.
 
 Lives here: running pipelines in an event loop of their own until a signal stops them.
-Not here: the pipeline itself, which knows nothing of signals and runs in any loop (`pipeline`).
+Not here: the pipeline itself, which knows nothing of signals and runs in any loop (`pipeline`), and how a
+signal is heard (`work.interrupts`).
 """
 
 import asyncio
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from threading import current_thread, main_thread
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from streamfeat.errors import InputError
 from streamfeat.stream.pipeline import Pipeline
+from streamfeat.work.interrupts import deferred, kept_by
 
 __all__ = ["run_until_interrupted", "signals_wait"]
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
 def signals_wait() -> Iterator[None]:
-    """SIGINT and SIGTERM wait until `run_until_interrupted` can hear them, or until the block ends.
+    """Interrupts wait until `run_until_interrupted` can hear them, or until the block ends.
 
     For opening sinks: a signal between opening them and running would leave half an output behind.
 
@@ -29,11 +27,8 @@ def signals_wait() -> Iterator[None]:
         InputError: an event loop is running in this thread, so that pipelines cannot have one of their own.
     """
     _refuse_running_loop()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
-    try:
+    with deferred():
         yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _refuse_running_loop() -> None:
@@ -50,7 +45,7 @@ def _refuse_running_loop() -> None:
 def run_until_interrupted(
     pipelines: Sequence[Pipeline[Any, Any]], interrupt: Callable[[], None] | None = None
 ) -> bool:
-    """Run pipelines side by side in a loop of their own; SIGINT and SIGTERM end them well.
+    """Run pipelines side by side in a loop of their own; SIGINT, SIGTERM and SIGHUP end them well.
 
     Args:
         pipelines: not run before.
@@ -76,23 +71,18 @@ def run_until_interrupted(
 
     async def run() -> None:
         loop = asyncio.get_running_loop()
-        # Only the main thread of a process can be told of signals.
-        names = _SIGNALS if current_thread() is main_thread() else ()
-        before = {name: signal.getsignal(name) for name in names}
-        for name in names:
-            loop.add_signal_handler(name, on_signal)
-        mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, names)
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                for pipeline in pipelines:
-                    tasks.create_task(pipeline.run())
-        except BaseExceptionGroup as group:
-            raise group.exceptions[0] from None
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            for name, handler in before.items():
-                loop.remove_signal_handler(name)
-                signal.signal(name, handler)
+
+        def hear() -> None:
+            with suppress(RuntimeError):  # the loop has just ended
+                loop.call_soon_threadsafe(on_signal)
+
+        with kept_by(hear):
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    for pipeline in pipelines:
+                        tasks.create_task(pipeline.run())
+            except BaseExceptionGroup as group:
+                raise group.exceptions[0] from None
 
     asyncio.run(run())
     return interrupted

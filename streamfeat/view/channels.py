@@ -112,6 +112,12 @@ class Board:
         """Show JSON values."""
         self._log(prefix, name, json.dumps(record), max(t_us, 0))
 
+    def forget(self, prefix: str) -> None:
+        """Close the channels of a camera."""
+        for channel in self._channels.pop(prefix, {}).values():
+            self._last.pop(channel.topic(), None)
+            channel.close()
+
     def close(self) -> None:
         """No more will be shown."""
 
@@ -122,9 +128,7 @@ class Board:
 
     def _channel(self, prefix: str, name: str) -> RawImageChannel | foxglove.Channel:
         if prefix not in self._channels and len(self._channels) >= MAX_CAMERAS:
-            for channel in self._channels.pop(next(iter(self._channels))).values():
-                self._last.pop(channel.topic(), None)
-                channel.close()
+            self.forget(next(iter(self._channels)))
         of_camera = self._channels.setdefault(prefix, {})
         if name not in of_camera:
             topic = f"{prefix}/{name}"

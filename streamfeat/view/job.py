@@ -5,13 +5,12 @@ Not here: sources (`sources`, `live.listen`), what is shown (`sink`).
 """
 
 import os
-import signal
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, Thread
 from typing import Any
 
 from streamfeat.classify.kernel import load_classifier
@@ -36,6 +35,7 @@ from streamfeat.view.player import Piece
 from streamfeat.view.server import PageServer
 from streamfeat.view.sink import Shows, ViewSink, about
 from streamfeat.view.sources import PlayJob, WatchJob
+from streamfeat.work.interrupts import kept_by
 
 __all__ = ["View", "has_display", "prefix_of"]
 
@@ -171,10 +171,11 @@ class View:
             InputError: an output, a port or the network cannot be used.
         """
         with ExitStack() as opened:
-            with self._heeding_signals():
+            with kept_by(self._stopped.set, is_promised=False):  # opening and compiling may be cut off
                 self._open(opened)
                 if self._is_recording and self._encoder:
                     warm_up(self._encoder, self._policy)
+            with kept_by(self._stopped.set):
                 if self._is_recording and self._is_served:
                     self._wait_for(self._looked, "waiting for the first viewer; Ctrl-C ends")
             if self._stopped.is_set():
@@ -284,18 +285,6 @@ class View:
             player.seek(round(number * 1e6))
         elif op == "speed" and (value is None or (number is not None and _MIN_SPEED <= number <= _MAX_SPEED)):
             player.set_speed(number)
-
-    @contextmanager
-    def _heeding_signals(self) -> Iterator[None]:
-        """SIGINT and SIGTERM mean to stop, and wait for what is under way: compiling cannot be cut off."""
-        # Only the main thread of a process can be told of signals.
-        names = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
-        before = {name: signal.signal(name, lambda *_: self._stopped.set()) for name in names}
-        try:
-            yield
-        finally:
-            for name, handler in before.items():
-                signal.signal(name, handler)
 
     def _wait_for(self, event: Event, line: str) -> None:
         if not self._stopped.is_set():

@@ -17,6 +17,7 @@ import json
 import os
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from threading import Event, Thread
 from typing import Any
 from urllib.parse import urlsplit
@@ -97,6 +98,11 @@ class PageServer:
         """Show JSON values."""
         self._put((prefix, name), json.dumps({"camera": prefix, "channel": name, "record": record}))
 
+    def forget(self, prefix: str) -> None:
+        """Keep nothing of a camera for browsers that come later."""
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._drop, prefix)
+
     def close(self) -> None:
         """Stop serving; browsers are told."""
         if self._loop.is_running():
@@ -113,11 +119,14 @@ class PageServer:
         if key not in self._latest:
             cameras = list(dict.fromkeys(camera for camera, _ in self._latest))
             if key[0] not in cameras and len(cameras) >= _MAX_CAMERAS:
-                for old in [old for old in self._latest if old[0] == cameras[0]]:
-                    del self._latest[old]
+                self._drop(cameras[0])
         self._latest[key] = message
         for browser in self._browsers:
             browser.show(key)
+
+    def _drop(self, camera: str) -> None:
+        for old in [old for old in self._latest if old[0] == camera]:
+            del self._latest[old]
 
     def _run(self, ready: Event) -> None:
         asyncio.set_event_loop(self._loop)

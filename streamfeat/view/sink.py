@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
+from streamfeat.stream.cameras import MAX_CAMERAS
 from streamfeat.stream.emission import Emission
 from streamfeat.view.observe import Sight, Slot, Throttle, Watch
 from streamfeat.view.pictures import bins_picture, event_picture, feature_columns, volume_picture
@@ -30,6 +31,9 @@ class Shows(Protocol):
 
     def record(self, prefix: str, name: str, t_us: int, record: dict[str, Any], /) -> None:
         """Show JSON values."""
+
+    def forget(self, prefix: str, /) -> None:
+        """A camera has left: keep nothing of it."""
 
 
 class ViewSink:
@@ -67,23 +71,40 @@ class ViewSink:
         self._slots: dict[str, Slot] = {}
         self._throttles: dict[str, Throttle] = {}
         self._judged: dict[str, list[int]] = {}
+        self._skipped = 0
         self.frames = 0
 
     @property
     def skipped(self) -> int:
         """Sights that were replaced before they could be drawn."""
-        return sum(slot.skipped for slot in list(self._slots.values()))
+        return self._skipped + sum(slot.skipped for slot in list(self._slots.values()))
 
     def tap(self) -> EventTap:
         """What the items of the stream pass through on their way to the engines."""
-        return EventTap(self._throttle, self._show_events)
+        return EventTap(self._throttle, self._show_events, self._forget)
 
     def watch(self, topic: str) -> Watch:
         """How to watch the engines of a camera."""
         if self._live:
             slot = self._slots.setdefault(topic, Slot())
+            self._bound(topic)
             return Watch(topic, self._throttle(), slot.put)
         return Watch(topic, self._throttle(), self._draw)
+
+    def _forget(self, topic: str) -> None:
+        """A camera has left; what it still has to show is not shown."""
+        slot = self._slots.pop(topic, None)
+        self._skipped += slot.skipped if slot else 0
+        self._throttles.pop(topic, None)
+        self._judged.pop(topic, None)
+        for board in self._boards:
+            board.forget(self._prefix(topic))
+
+    def _bound(self, topic: str) -> None:
+        """Of cameras that end without a word the oldest are forgotten; emissions may come after that word."""
+        for known in (self._slots, self._throttles, self._judged):
+            for old in [one for one in list(known) if one != topic][: max(0, len(known) - MAX_CAMERAS)]:
+                self._forget(old)
 
     def _throttle(self) -> Throttle:
         return Throttle(self._rate) if self._live else Throttle(self._rate, clock=None)

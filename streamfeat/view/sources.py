@@ -30,6 +30,7 @@ from streamfeat.stream.batch import EmissionBatch
 from streamfeat.stream.emission import Emission, EmitPolicy
 from streamfeat.stream.pipeline import Pipeline, Processor
 from streamfeat.stream.replay import items_of_split
+from streamfeat.stream.room import Room
 from streamfeat.stream.session import Session
 from streamfeat.stream.signals import run_until_interrupted, signals_wait
 from streamfeat.stream.sinks import Sink
@@ -109,7 +110,14 @@ class PlayJob:
             if split is not None and split not in {label.split for label in recording.labels}:
                 raise InputError(f"{source}: has no samples of split {split!r}")
         self._session = (
-            Session(encoder, emit, classifier, clock=time.perf_counter, engine=make_engine, threads=threads)
+            Session(
+                encoder,
+                emit,
+                classifier,
+                clock=time.perf_counter,
+                engine=Room().maker("", make_engine),
+                threads=threads,
+            )
             if encoder
             else None
         )

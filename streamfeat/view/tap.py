@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from streamfeat.events import Events, Resolution
 from streamfeat.messages.packets import Packet
-from streamfeat.stream.cameras import MAX_CAMERAS
+from streamfeat.stream.cameras import MAX_CAMERAS, CameraLeft
 from streamfeat.view.observe import Throttle
 
 __all__ = ["EventTap", "RecentEvents"]
@@ -114,11 +114,17 @@ class EventTap:
     Args:
         make_throttle: how often there is a picture of a camera.
         see: told what it is made of; in the thread that iterates.
+        left: told there of a camera that has left.
     """
 
-    def __init__(self, make_throttle: Callable[[], Throttle], see: Callable[[RecentEvents], None]) -> None:
+    def __init__(
+        self,
+        make_throttle: Callable[[], Throttle],
+        see: Callable[[RecentEvents], None],
+        left: Callable[[str], None] = lambda topic: None,
+    ) -> None:
         """Nothing has passed."""
-        self._make_throttle, self._see = make_throttle, see
+        self._make_throttle, self._see, self._left = make_throttle, see, left
         self._cameras: dict[str, _Recent] = {}
         self.seen_us = _SEEN_US
 
@@ -128,6 +134,9 @@ class EventTap:
             if isinstance(item, Packet) and len(item.events):
                 self._look(item)
             yield item
+            if isinstance(item, CameraLeft):
+                self._cameras.pop(item.topic, None)
+                self._left(item.topic)
 
     def _look(self, packet: Packet) -> None:
         recent = self._cameras.get(packet.topic)

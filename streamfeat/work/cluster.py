@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
-from threading import current_thread, main_thread
+from multiprocessing import resource_tracker
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -217,15 +217,17 @@ def local(n_workers: int, threads: int | None = None) -> Iterator[Cluster]:
 
 @contextmanager
 def _ctrl_c_ignored() -> Iterator[None]:
-    """Processes that are started here do not hear Ctrl-C of the terminal; this process ends them."""
-    if current_thread() is not main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Processes that are started here do not hear Ctrl-C of the terminal; this process does, and ends them.
+
+    They inherit what the thread blocks that starts them, now or later: that of the cluster, which inherits it
+    from this one. The resource tracker of multiprocessing unblocks signals as it starts, so it starts before.
+    """
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @functools.cache

@@ -24,11 +24,14 @@ from torture.damage import damaged_recordings  # noqa: E402
 from torture.faults import faults  # noqa: E402
 from torture.fuzz import hostile_bytes  # noqa: E402
 from torture.hours import hours  # noqa: E402
+from torture.interrupts import interrupts  # noqa: E402
 from torture.kills import kills  # noqa: E402
 from torture.outside import outside  # noqa: E402
 from torture.soak import soak  # noqa: E402
 from torture.state import state  # noqa: E402
+from torture.surroundings import surroundings  # noqa: E402
 from torture.table import Part, Row, Trials, markdown  # noqa: E402
+from torture.viewers import viewers  # noqa: E402
 
 PARTS: dict[str, tuple[Part, str]] = {
     "bytes": (hostile_bytes, "every decoder, fed with hostile bytes"),
@@ -36,8 +39,11 @@ PARTS: dict[str, tuple[Part, str]] = {
     "kills": (kills, "kill -9 at random moments of record, learn, train, convert, evaluate"),
     "state": (state, "kill -9 of a listener that keeps its state"),
     "faults": (faults, "full disks, signals, sinks that raise, tasks that are cancelled"),
+    "interrupts": (interrupts, "SIGINT, SIGTERM and SIGHUP in every phase of every command, within a second"),
     "crowd": (crowd, "copies of packets and cameras that come and go, without end"),
+    "viewers": (viewers, "what a view sees without end: new cameras, and browsers that come and go"),
     "outside": (outside, "pages of browsers, silent clients, claims of gigabytes, names that do things"),
+    "surroundings": (surroundings, "other users, clocks that are set, suspending, 1 % of a core, routers"),
     "hours": (hours, "two hours of listen, record and view: cameras, disks, clocks and browsers"),
     "soak": (soak, "a day of stream time, 500 million events"),
 }

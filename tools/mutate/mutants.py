@@ -399,8 +399,8 @@ MUTANTS = [
     Mutant(
         "emissions wait without bound for a program",
         "stream/emission_stream.py",
-        "len(emissions) <= _WAITING",
-        "len(emissions) <= 1e9",
+        "len(emissions) > _WAITING:",
+        "len(emissions) > 1e9:",
         "tests/test_async.py -k find_no_room",
     ),
     Mutant(
