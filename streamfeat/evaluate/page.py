@@ -163,6 +163,17 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
             published = [figures[method] for figures in paper.values()]
             _line(plot, list(map(int, paper)), published, label, len(methods) + i, line_dash="dashed")
         yield _with_legend(plot)
+        if timed := [row for row in rows if "update_us" in row]:
+            yield _update_costs(name, title, timed)
+
+
+def _update_costs(name: str, title: str, rows: Sequence[dict[str, Any]]) -> "figure":
+    """What an update costs over the values of a sweep."""
+    plot = _plot(title, "update of one event, us", height=_SMALL + 80, y_axis_type="log")
+    for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+        mine = sorted((row["setting"][name], row["update_us"]) for row in rows if row["method"] == method)
+        _line(plot, [value for value, _ in mine], [cost for _, cost in mine], method, i)
+    return _with_legend(plot)
 
 
 def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:

@@ -10,6 +10,7 @@ from typing import Any
 
 from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
+from streamfeat.evaluate.published import PAPER_SWEEPS
 from streamfeat.learn.settings import Setting
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "WITHOUT_KERNELS",
     "Cell",
     "Trial",
+    "paper_sweeps",
     "parse_sweep",
     "plan_cells",
     "used_by",
@@ -186,6 +188,11 @@ _KINDS: dict[type, tuple[Any, str]] = {
     type(None): (float, "numbers, such as --sweep {name}=0.25,0.5"),
 }
 """By the type of the default: how a value is read, and what to give; None stands in for a number."""
+
+
+def paper_sweeps() -> list[tuple[str, list[Any]]]:
+    """The sweeps of the paper's third table, as from `parse_sweep`: filters, patch and bins."""
+    return [(name, [*figures]) for name, figures in PAPER_SWEEPS.items()]
 
 
 def plan_cells(
