@@ -57,7 +57,8 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, dart, est, hfirst, gabor-snn, counts; "
+            "repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
@@ -154,6 +155,7 @@ def evaluate(
     block of neighbours: samples that were cut from one video are near copies. With -o every finished run is
     kept beside the result: the same command goes on after an interruption.
     """
+    from streamfeat.evaluate.methods import needs
     from streamfeat.evaluate.page import check_page, write_page
     from streamfeat.evaluate.plan import (
         TRAINING_PRESETS,
@@ -192,6 +194,7 @@ def evaluate(
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
+    needs(methods)
     parsed = (paper_sweeps() if paper else []) + [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     try:
