@@ -6,19 +6,21 @@ Not here: how the method is chosen (`methods`). This module needs PyTorch, the e
 
 import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from streamfeat.errors import InputError
 from streamfeat.evaluate.samples import downsampled, training_samples, until
 from streamfeat.events import Events, Resolution
 from streamfeat.recordings.reader import Recording
+
+with suppress(ImportError):  # where it is not there `methods.needs` says so before any of this is called
+    import torch
+    from torch import nn
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
