@@ -101,7 +101,7 @@ def examine(path: Path, setting: Setting, formulation: str) -> dict[str, Any]:
 def solutions(
     x: NDArray[np.float32], atoms: NDArray[np.float32], penalty: float
 ) -> dict[str, dict[str, float]]:
-    """How far others' objectives lie above ours, at most and on average, relative; below 0 where ours is worse."""
+    """How far objectives of others lie above ours, relative; below 0 where ours is worse."""
     learner = DictionaryLearner(len(atoms), threshold=penalty, gap=GAP)
     learner.components_, learner.n_features_in_ = atoms, atoms.shape[1]
     ours = learner.transform(x).astype(np.float64)
@@ -137,7 +137,7 @@ def table(results: Sequence[dict[str, Any]]) -> str:
         )
     lines += [
         "",
-        "| recording | the same lassos by | objective above ours, least to most | largest difference of codes |",
+        "| recording | the same lassos by | objective above ours, least to most | codes differ by |",
         "|---|---|---:|---:|",
     ]
     for one in results:
