@@ -7,8 +7,8 @@ Not here: the methods (`streamfeat.evaluate`), and how updates are timed (`strea
     streamfeat evaluate ncars.mcap --method direct --method hats --method dart -o result.json
     python -m tools.bench.comparators ncars.mcap result.json --json table.json
 
-Filters of `direct`, `inverse`, `kmeans` and `random` are learned again in the setting of the result, from as
-few volumes as it allows and in two iterations: which filters they are hardly changes what an update costs. EST
+Filters of `direct`, `inverse`, `kmeans` and `random` are learned again in the setting of the result, from
+as few volumes as it allows and in two iterations: which filters they are hardly changes what an update costs. EST
 has no update: its network reads a whole sample, and what that took in the result is the column beside.
 """
 
