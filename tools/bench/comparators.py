@@ -8,8 +8,8 @@ Not here: the methods (`streamfeat.evaluate`), and how updates are timed (`strea
     python -m tools.bench.comparators ncars.mcap result.json --json table.json
 
 Filters of `direct`, `inverse`, `kmeans` and `random` are learned again in the setting of the result, from
-as few volumes as it allows and in two iterations: which filters they are hardly changes what an update costs. EST
-has no update: its network reads a whole sample, and what that took in the result is the column beside.
+as few volumes as it allows and in two iterations: which filters they are hardly changes what an update costs.
+EST has no update: its network reads a whole sample, and what that took in the result is the column beside.
 """
 
 import argparse
