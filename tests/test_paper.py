@@ -9,9 +9,9 @@ from streamfeat.cli import evaluating
 from streamfeat.evaluate import run as run_module
 from streamfeat.evaluate.costs import update_us
 from streamfeat.evaluate.page import _sweeps
-from streamfeat.evaluate.plan import paper_sweeps
-from streamfeat.evaluate.published import PAPER_SWEEPS
-from streamfeat.evaluate.tables import sweep_tables
+from streamfeat.evaluate.plan import METHODS, paper_sweeps
+from streamfeat.evaluate.published import ACCURACIES, PAPER_SWEEPS
+from streamfeat.evaluate.tables import published_table, sweep_tables
 from streamfeat.recordings.reader import open_recording
 
 
@@ -82,6 +82,20 @@ def swept_result():
     ]
     published = {"sweeps": PAPER_SWEEPS, "data": "N-Caltech101", "citation": "theirs"}
     return {"rows": rows, "published": published}
+
+
+def test_published_accuracies_stand_beside_ours():
+    figures = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "swept": ""}
+    rows = [{"method": method, **figures} for method in ("direct", "counts", "dart")]
+    header, lines = published_table({"rows": rows, "published": {"accuracies": ACCURACIES}})
+    assert header[:4] == ("method", "here", "95 % interval", "published, N-Caltech101")
+    assert lines == [
+        ["direct", "0.500", "0.400-0.600", "0.771", "0.813", "0.968"],
+        ["dart", "0.500", "0.400-0.600", "0.703", "", "0.980"],
+    ]
+    assert set(ACCURACIES) <= set(METHODS)
+    both = PAPER_SWEEPS["bins"][7]
+    assert {method: ACCURACIES[method]["N-Caltech101"] for method in both} == both
 
 
 def test_what_an_update_costs_stands_beside_the_papers_figures():

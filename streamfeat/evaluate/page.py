@@ -22,6 +22,7 @@ from streamfeat.evaluate.tables import (
     in_order,
     notes,
     online_table,
+    published_table,
     sweep_tables,
     value_text,
 )
@@ -41,6 +42,11 @@ _MOST_COUNTS = 30
 _PAIRS_SHOWN = 10
 _SHORT_NAME = 2
 """Letters of a name that has room beside others."""
+
+_PUBLISHED = (
+    "Beside what was published, of recorded data, each on its own split and with its own classifier: figures "
+    "in one row are not of the same samples unless these recordings are that data set."
+)
 
 Parts = list[Any]
 
@@ -75,6 +81,9 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     warnings = [note for note in notes(result) if note.startswith("WARNING")]
     said = [note for note in notes(result) if note not in warnings]
     accuracy += [*warnings, _accuracies(rows), table]
+    header, beside = published_table(result)
+    if beside:
+        accuracy += [_PUBLISHED, Table(header, beside, [False] + [True] * (len(header) - 1))]
     header, folds = fold_table(result)
     if folds:
         folded = Table(header, folds, [False] + [True] * (len(header) - 1))

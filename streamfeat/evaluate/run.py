@@ -21,7 +21,7 @@ from streamfeat.evaluate.cell import run_cells
 from streamfeat.evaluate.leakage import check_leakage
 from streamfeat.evaluate.methods import Report, model_path
 from streamfeat.evaluate.plan import Cell
-from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
+from streamfeat.evaluate.published import ACCURACIES, PAPER, PAPER_SWEEPS, SWEEP_DATA
 from streamfeat.evaluate.scores import (
     SHARE,
     accuracy_interval,
@@ -222,7 +222,12 @@ def evaluate(
         "interval": f"95 % bootstrap interval over {_UNITS_IN_WORDS[data.groups]}",
         "leakage": leakage,
         "rows": rows,
-        "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
+        "published": {
+            "citation": PAPER,
+            "data": SWEEP_DATA,
+            "sweeps": PAPER_SWEEPS,
+            "accuracies": ACCURACIES,
+        },
         "machine": describe_machine(),
     }
 

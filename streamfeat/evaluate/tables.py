@@ -20,6 +20,7 @@ __all__ = [
     "in_order",
     "notes",
     "online_table",
+    "published_table",
     "sweep_tables",
     "value_text",
 ]
@@ -193,6 +194,18 @@ def early_table(result: dict[str, Any]) -> Lines:
         ]
         for row in rows
     ]
+
+
+def published_table(result: dict[str, Any]) -> Lines:
+    """Accuracy here beside what was published of each method on recorded data; no rows where nothing was."""
+    published = result["published"].get("accuracies", {})
+    names = list(dict.fromkeys(name for figures in published.values() for name in figures))
+    lines: list[Sequence[str]] = []
+    for row in base_rows(result):
+        if figures := published.get(row["method"]):
+            theirs = [f"{figures[name]:.3f}" if name in figures else "" for name in names]
+            lines.append([row["method"], f"{row['accuracy']:.3f}", _interval(row), *theirs])
+    return ("method", "here", "95 % interval", *(f"published, {name}" for name in names)), lines
 
 
 def confusion_table(row: dict[str, Any], names: Sequence[str]) -> Lines:
