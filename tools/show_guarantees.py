@@ -114,6 +114,7 @@ def solutions(
             "least": float(above.min()),
             "most": float(above.max()),
             "codes": float(np.abs(codes - ours).max()),
+            "used": float(np.median(np.count_nonzero(codes, axis=1))),
         }
     return found
 
@@ -137,13 +138,14 @@ def table(results: Sequence[dict[str, Any]]) -> str:
         )
     lines += [
         "",
-        "| recording | the same lassos by | objective above ours, least to most | codes differ by |",
-        "|---|---|---:|---:|",
+        "| recording | the same lassos by | objective above ours, least to most | codes differ by | atoms used |",
+        "|---|---|---:|---:|---:|",
     ]
     for one in results:
         for name, found in one.get("solutions", {}).items():
             span = f"{found['least']:+.1e} to {found['most']:+.1e}"
-            lines.append(f"| {one['recording']} | {name} | {span} | {found['codes']:.1e} |")
+            beside = f"{span} | {found['codes']:.1e} | {found['used']:g}"
+            lines.append(f"| {one['recording']} | {name} | {beside} |")
     return "\n".join(lines)
 
 
