@@ -138,7 +138,7 @@ def table(results: Sequence[dict[str, Any]]) -> str:
         )
     lines += [
         "",
-        "| recording | the same lassos by | objective above ours, least to most | codes differ by | atoms used |",
+        "| recording | lassos by | objective above ours, least to most | codes differ by | atoms used |",
         "|---|---|---:|---:|---:|",
     ]
     for one in results:
