@@ -11,6 +11,7 @@ from typing import Any
 import naive
 import numpy as np
 from camera_files_scene import ecf
+from numba import njit
 from streams import EXACT_KINDS, GAP, KINDS, LASSO_KINDS, random_encoder, random_events
 
 from streamfeat.engine.engine import Engine
@@ -1648,6 +1649,14 @@ class Row:
     @property
     def name(self) -> str:
         return self.kernel.__name__
+
+    @property
+    def call(self) -> Callable[..., Any]:
+        """The kernel as Python can call it: one that only kernels can call is compiled once more."""
+        options = self.kernel.targetoptions
+        if not options.get("no_cpython_wrapper"):
+            return self.kernel
+        return njit(error_model=options["error_model"], _nrt=options["_nrt"])(self.kernel.py_func)
 
     @property
     def twin(self) -> Callable[..., Any]:

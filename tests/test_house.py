@@ -257,7 +257,7 @@ def test_kernels_are_compiled_in_one_way(name):
     for node in ast.walk(tree_of(NAMES[name])):
         if isinstance(node, ast.FunctionDef):
             (decorator,) = node.decorator_list
-            assert decorator.id in {"kernel", "inlined", "allocating"}
+            assert decorator.id in {"kernel", "inlined", "spliced", "allocating"}
 
 
 @pytest.mark.parametrize("name", sorted(VECTOR_CODE))

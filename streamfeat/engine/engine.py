@@ -39,7 +39,7 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
 from streamfeat.kernels.predict import Weights
-from streamfeat.kernels.update import mark_dirty, read, renew, settle, update
+from streamfeat.kernels.update import mark_dirty, read, renew, settle
 from streamfeat.report.shown import Shown
 
 __all__ = ["Engine", "EngineStats"]
@@ -177,20 +177,19 @@ class Engine(Shown):
         Returns:
             whether nothing is left to prepare.
         """
+        if len(self._state.cursors) == 1:  # there is no plane that could look ahead
+            return True
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
         left = look_ahead(volumes, volumes, columns, self._operator, self._state)
         return bool(left > 0) and all(scale.prepare(columns) for _, scale in self._further)
 
     def _update(self) -> None:
-        """Bring the current plane up to date; asks first, for a call of a kernel costs 10 us by itself."""
+        """Bring the current plane up to date; asks first, for each call of a kernel costs 6 us by itself."""
         operator, state, crew = self._operator, self._state, self._crew
         if self._is_complete and not state.clock[CLOCK_TOUCHED]:
             return
         filters = operator.offset.shape[0]
-        if not crew.is_worth_counting(self._most_volumes * filters):
-            update(operator, state)
-            return
         mark_dirty(operator, state)
         renewing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
         crew.share(renew, renewing, operator, state)
@@ -243,7 +242,7 @@ class Engine(Shown):
     @one_thread
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._crew.threads > 1:
+        if self._crew.is_worth_counting(self._most_volumes * self._operator.offset.shape[0]):
             self._update()
         features = np.zeros(self.encoder.n_features, np.float32)
         read(self._operator, self._state, features[: n_features(self._operator)])
@@ -373,7 +372,7 @@ class Engine(Shown):
             state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
             state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        update(self._operator, state)
+        self._update()
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
         state.tally[:] = snapshot.tally
         state.encoded[:] = 0

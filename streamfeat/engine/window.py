@@ -13,7 +13,7 @@ from streamfeat.engine.state import allocate_state
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.layout import CLOCK_SLOT, Operator
-from streamfeat.kernels.planes import fill_plane
+from streamfeat.kernels.planes import ALONE, FIRST, complete, finish, list_missing
 
 __all__ = ["count_window", "encode_window"]
 
@@ -69,7 +69,9 @@ def encode_window(
     state = allocate_state(geometry, pooling, resolution, keep=False)
     state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
     state.clock[CLOCK_SLOT] = geometry.n_bins - 1  # the window ends with the last slot
-    fill_plane(pooling, state)
+    list_missing(pooling, state)
+    complete(FIRST, ALONE, pooling, state)
+    finish(ALONE, pooling, state)
     features = np.empty(n_features(pooling), np.float32)
     read_features(pooling, state, features)
     return features

@@ -29,11 +29,18 @@ def _kept(**options: Any) -> Any:
     return decorate
 
 
-kernel = _kept(error_model="numpy", _nrt=False)
+_PLAIN = {"error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+
+kernel = _kept(**_PLAIN)
 """Compiled once for each set of argument types, kept on disk, and free of the GIL while it runs."""
 
-inlined = _kept(error_model="numpy", _nrt=False, forceinline=True)
-"""The same for small parts of a loop over events: a call would copy all arrays' descriptions."""
+inlined = _kept(**_PLAIN, no_cpython_wrapper=True, forceinline=True)
+"""The same for small parts of a loop over events: a call would copy all arrays' descriptions. Only kernels
+can call it, Python cannot: to describe forty arrays to it takes a quarter of a second of compiling."""
+
+spliced = _kept(**_PLAIN, inline="always")
+"""The same for a sequence of kernels: whoever calls it has its lines, for LLVM would optimise all that is in
+them once more for it."""
 
 allocating = _kept()
 """The same for what makes arrays, whose references must be counted."""

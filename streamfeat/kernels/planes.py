@@ -22,7 +22,7 @@ complete when its bin begins is completed then.
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.compiled import inlined, kernel, spliced
 from streamfeat.kernels.dense import can_wait, let_in, multiply
 from streamfeat.kernels.encode import ADD, pool_volume
 from streamfeat.kernels.ingest import slot_of
@@ -211,13 +211,25 @@ def share_of(part: int, parts: int, state: State) -> tuple[int, int]:
 
 
 @inlined
+def first_with_load(least: int, load: NDArray[np.int32], n: int) -> int:
+    """The first of `n` volumes on the dirty stack before which there is at least so much work; or `n`."""
+    low, high = 0, n
+    while low < high:
+        middle = (low + high) // 2
+        if load[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
 def share_of_load(part: int, parts: int, state: State) -> tuple[int, int]:
     """The same for volumes that `list_missing` found, in parts of nearly the same work."""
     n = state.clock[CLOCK_DIRTY]
-    before, total = state.load[:n], np.int64(state.load[n])
-    first = np.searchsorted(before, -(-total * part // parts))
-    last = np.searchsorted(before, -(-total * (part + 1) // parts))
-    return int(first), int(last)
+    total = np.int64(state.load[n])
+    first = first_with_load(-(-total * part // parts), state.load, n)
+    return first, first_with_load(-(-total * (part + 1) // parts), state.load, n)
 
 
 @kernel
@@ -268,7 +280,7 @@ def finish(parts: int, operator: Operator, state: State) -> None:
     state.clock[CLOCK_DIRTY] = 0
 
 
-@kernel
+@spliced
 def fill_plane(operator: Operator, state: State) -> None:
     """Let all volumes that are missing enter the current plane."""
     list_missing(operator, state)

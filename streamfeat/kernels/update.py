@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.kernels.change import follow_changes, follow_rest
-from streamfeat.kernels.compiled import inlined, kernel
+from streamfeat.kernels.compiled import inlined, kernel, spliced
 from streamfeat.kernels.encode import read_features
 from streamfeat.kernels.ingest import slot_of
 from streamfeat.kernels.layout import (
@@ -152,7 +152,7 @@ def settle(state: State) -> None:
     state.clock[CLOCK_DIRTY] = 0
 
 
-@kernel
+@spliced
 def update(operator: Operator, state: State) -> None:
     """Make the current plane that of the counts.
 

@@ -32,7 +32,6 @@ from streamfeat.files.outputs import locked_file
 from streamfeat.kernels import cache
 from streamfeat.kernels.decode import place_events
 from streamfeat.kernels.ingest import count_events
-from streamfeat.kernels.planes import look_ahead
 from streamfeat.kernels.update import mark_dirty, read, renew, settle
 
 __all__ = ["Compilers", "compile_together", "is_compiled"]
@@ -173,7 +172,6 @@ def _compile(half: str, *, narrow: bool, told: Callable[[], object] = lambda: No
     if half == "codes":
         encoder.encode(event, resolution)
         told()
-        look_ahead(0, 0, 0, operator, state)
         return
     count_events(event, operator, state)
     place_events(event, *resolution, 0, np.empty(1, np.int64), np.empty(2, np.int64))

@@ -29,7 +29,7 @@ def measure_kernels(setting: Setting) -> dict[str, Any]:
         originals = [row.make(np.random.default_rng([seed, 7])) for seed in range(1 if setting.quick else 4)]
         contestants = {
             name: _repeated(function, originals, copied, repeats)
-            for name, function, repeats in (("kernel", row.kernel, 5), ("twin", row.twin, 1))
+            for name, function, repeats in (("kernel", row.call, 5), ("twin", row.twin, 1))
         }
         result = race(contestants, setting.rounds(5))
         figures[row.name] = {
