@@ -288,6 +288,24 @@ def test_a_baseline_sees_the_events_of_its_window_in_any_order(baseline):
     np.testing.assert_array_equal(none, np.zeros(baseline.n_features))
 
 
+@pytest.mark.parametrize(
+    "baseline", [*BASELINES[1:], FirstSpikes(4), LeakySpikes(4)], ids=lambda b: type(b).__name__
+)
+def test_coarser_pixels_are_those_of_a_smaller_sensor(baseline):
+    height, width = tiny.RESOLUTION
+    events = tiny.steady(0, 90_000, 400)
+    halved = events.copy()
+    halved["x"], halved["y"] = events["x"] // 2, events["y"] // 2
+    smaller = -(-height // 2), -(-width // 2)
+    coarse = replace(baseline, downsample=2)
+    np.testing.assert_array_equal(coarse.encode(events, tiny.RESOLUTION), baseline.encode(halved, smaller))
+    assert coarse.fingerprint != baseline.fingerprint
+    beyond = events.copy()
+    beyond["x"][::2] = width  # beyond the sensor, though not beyond its last coarse pixel
+    inside = coarse.encode(beyond[1::2], tiny.RESOLUTION)
+    np.testing.assert_array_equal(coarse.encode(beyond, tiny.RESOLUTION), inside)
+
+
 def test_count_images_count_by_polarity_and_place():
     events = make_events([0, 15, 15], [0, 11, 11], [1, 0, 0], [1, 2, 3])
     image = CountImage(2).encode(events, (12, 16)).reshape(2, 2, 2)

@@ -80,17 +80,6 @@ def test_chunks_change_nothing(monkeypatch):
     assert whole.sum() == 700
 
 
-def test_coarser_pixels_are_those_of_a_smaller_sensor():
-    rng = np.random.default_rng(2)
-    events = at(*rng.integers(0, 31, (2, 200)))
-    words = rng.random((5, 84), np.float32) / 20
-    half = events.copy()
-    half["x"], half["y"] = events["x"] // 2, events["y"] // 2
-    coarse = RetinalWords(words, downsample=2)
-    np.testing.assert_array_equal(coarse.encode(events, (31, 31)), RetinalWords(words).encode(half, (16, 16)))
-    assert coarse.fingerprint != RetinalWords(words).fingerprint
-
-
 def test_words_are_learned_from_training_samples_alone(tmp_path):
     items = tiny.labelled_items(6)
     path = tiny.write_items(tmp_path / "animals.mcap", items)
