@@ -1163,6 +1163,16 @@ def features_from(codes, encoding, pooling=2):
     return cells.ravel()
 
 
+def features_over_time(counts, encoder):
+    """Features of volumes shorter than the window: their codes summed over each cell, and over time."""
+    geometry = encoder.geometry
+    total = 0
+    for end in range(len(counts), geometry.depth - 1, -geometry.time_stride):
+        codes = codes_of(counts[end - geometry.depth : end], encoder)
+        total = total + features_from(codes, encoder.encoding, geometry.pooling)
+    return total
+
+
 # streamfeat.kernels.denoise
 
 

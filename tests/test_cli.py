@@ -333,7 +333,7 @@ def bad(home, tmp_path_factory):
     write_messages(bad / "two_topics", event_packet(), topics=("/left", "/right"))
     write_messages(bad / "bad_length", event_packet(payload=bytes(7)))
     write_messages(bad / "unknown_encoding", event_packet("morse"))
-    changed_model(home / "direct", bad / "new_model", version=3)
+    changed_model(home / "direct", bad / "new_model", version=4)
     changed_model(home / "direct", bad / "odd_model", arrays={"mean": np.zeros(7, np.float32)})
     (bad / "cut_model").write_bytes((home / "direct").read_bytes()[:-10])
     tiny.write_items(bad / "unlabelled.mcap", [tiny.packet(tiny.steady(0, 90_000, 900))])
@@ -373,7 +373,7 @@ REFUSALS = {
     "unknown encoding": (["info", "{bad}/unknown_encoding"], "morse"),
     "replay of a missing file": (["replay", "{bad}/missing", "-m", "{home}/direct"], "cannot be opened"),
     "missing model": (["replay", "{home}/test.mcap", "-m", "{bad}/missing"], "no such file"),
-    "model of another version": (["replay", "{home}/test.mcap", "-m", "{bad}/new_model"], "format version 3"),
+    "model of another version": (["replay", "{home}/test.mcap", "-m", "{bad}/new_model"], "format version 4"),
     "model of wrong shape": (["replay", "{home}/test.mcap", "-m", "{bad}/odd_model"], "mean has shape (7,)"),
     "model cut short": (["replay", "{home}/test.mcap", "-m", "{bad}/cut_model"], "not a readable"),
     "model that is a classifier": (["replay", "{home}/test.mcap", "-m", "{home}/direct.clf"], "encoder file"),

@@ -96,6 +96,8 @@ def evaluate(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    volume_bins: options.VolumeBins = None,
+    time_stride: options.TimeStride = None,
     lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
     start: options.Start = None,

@@ -78,6 +78,8 @@ def learn(
     downsample: options.Downsample = None,
     max_count: options.MaxCount = None,
     pooling: options.Pooling = None,
+    volume_bins: options.VolumeBins = None,
+    time_stride: options.TimeStride = None,
     lambda0: options.Lambda0 = None,
     threshold: options.Threshold = None,
     start: options.Start = None,

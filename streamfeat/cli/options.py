@@ -36,6 +36,8 @@ __all__ = [
     "Start",
     "Stride",
     "Threshold",
+    "TimeStride",
+    "VolumeBins",
     "Volumes",
     "WindowMs",
     "setting_given",
@@ -88,6 +90,19 @@ Pooling = Annotated[
     int | None,
     typer.Option(
         help="Cells along each side, in each of which codes are summed.", show_default=_shown("pooling")
+    ),
+]
+VolumeBins = Annotated[
+    int | None,
+    typer.Option(
+        help="Bins of a local volume, fewer than the window has; codes are summed over time then, too.",
+        show_default="those of the window",
+    ),
+]
+TimeStride = Annotated[
+    int | None,
+    typer.Option(
+        help="Bins between volumes at the same place, with --volume-bins.", show_default=_shown("time_stride")
     ),
 ]
 Lambda0 = Annotated[

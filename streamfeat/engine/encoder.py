@@ -4,7 +4,6 @@ Lives here: how an encoder is made, checked, saved, loaded, and applied to one w
 Not here: learning the matrices (`learn`), and anything that changes as events come (`engine`).
 """
 
-import dataclasses
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -25,10 +24,19 @@ from streamfeat.files.safetensors_file import one_line, read_safetensors, write_
 from streamfeat.kernels.layout import FEATURE_ENCODINGS, Operator
 from streamfeat.report.shown import Shown
 
-__all__ = ["NARROW_VERSION", "WIDE_VERSION", "Encoder", "Encoding", "FeatureMap", "Formulation"]
+__all__ = [
+    "GENERAL_VERSION",
+    "NARROW_VERSION",
+    "WIDE_VERSION",
+    "Encoder",
+    "Encoding",
+    "FeatureMap",
+    "Formulation",
+]
 
-WIDE_VERSION, NARROW_VERSION = 1, 2
-"""Format versions of files: the second holds what the first does, and the steps of the narrow state."""
+WIDE_VERSION, NARROW_VERSION, GENERAL_VERSION = 1, 2, 3
+"""Format versions of files: the second holds what the first does, and the steps of the narrow state; the
+third, either with a geometry that those before could not describe."""
 
 _KIND = "streamfeat-encoder"
 _SCALES_KIND = "streamfeat-scales"
@@ -263,7 +271,7 @@ class Encoder(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file; the file appears whole or not at all."""
-        versions = [NARROW_VERSION if scale.is_narrow else WIDE_VERSION for scale in self.scales]
+        versions = [scale._version for scale in self.scales]
         if self.further:
             parts = [scale._parts() for scale in self.scales]
             each = [(one[0], one[1] | {"version": v}) for one, v in zip(parts, versions, strict=True)]
@@ -271,13 +279,19 @@ class Encoder(Shown):
         else:
             write_safetensors(Path(path), _KIND, versions[0], *self._parts())
 
+    @property
+    def _version(self) -> int:
+        if self.geometry.is_general:
+            return GENERAL_VERSION
+        return NARROW_VERSION if self.is_narrow else WIDE_VERSION
+
     def _parts(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Arrays and header of the first scale."""
         operator = self.operator
         arrays = {"filters": self.filters, "whitening": self.whitening, "mean": self.mean}
         arrays |= {name: getattr(operator, name) for name in _stored_arrays(narrow=self.is_narrow)}
         header = {
-            "geometry": dataclasses.asdict(self.geometry),
+            "geometry": self.geometry.as_dict(),
             "formulation": self.formulation,
             "encoding": self.encoding,
             "threshold": self.threshold,
@@ -293,7 +307,8 @@ class Encoder(Shown):
         Raises:
             InputError: the file is missing, cut short, of another version, or not a model.
         """
-        arrays, header = read_safetensors(Path(path), (_KIND, _SCALES_KIND), WIDE_VERSION, NARROW_VERSION)
+        versions = WIDE_VERSION, NARROW_VERSION, GENERAL_VERSION
+        arrays, header = read_safetensors(Path(path), (_KIND, _SCALES_KIND), *versions)
         try:
             if header["format"] == _KIND:
                 return cls._from_parts(arrays, header)

@@ -8,6 +8,7 @@ pooled sums up to date with whatever has changed since. What is read depends on 
 time, never on how often it was read or how the stream was cut into batches.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,31 +16,29 @@ from numpy.typing import NDArray
 
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.operator import n_features, with_fixed_point
+from streamfeat.engine.past import Past
 from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, checked_time
-from streamfeat.engine.state import allocate_state
+from streamfeat.engine.state import allocate_state, clear_state, enter_counts
 from streamfeat.engine.threads import Crew, one_thread
 from streamfeat.engine.trace import Trace, joined, trace_events
+from streamfeat.engine.update import is_complete, is_worth_sharing, update_plane
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow
 from streamfeat.kernels.ingest import advance_to_bin, count_events
 from streamfeat.kernels.lasso import CODE
 from streamfeat.kernels.layout import (
-    BEFORE_TIME,
-    CLOCK_DIRTY,
     CLOCK_NOW,
     CLOCK_ORIGIN,
     CLOCK_PLANE,
     CLOCK_SLOT,
-    CLOCK_START,
-    CLOCK_TOUCHED,
-    CURSOR_CODED,
     MOMENT_SQUARES,
     TALLY_EVENTS,
+    State,
 )
-from streamfeat.kernels.planes import complete, finish, list_missing, look_ahead
+from streamfeat.kernels.planes import look_ahead
 from streamfeat.kernels.predict import Weights
-from streamfeat.kernels.update import mark_dirty, read, renew, settle
+from streamfeat.kernels.update import read
 from streamfeat.report.shown import Shown
 
 __all__ = ["Engine", "EngineStats"]
@@ -98,15 +97,14 @@ class Engine(Shown):
         self.resolution = resolution
         self.grid_shape = encoder.geometry.grid_shape(resolution)
         self._crew = Crew(threads)
-        self._operator = with_fixed_point(encoder.operator, self.grid_shape)
+        geometry, origin = encoder.geometry, checked_time(origin_us)
+        operator = with_fixed_point(encoder.operator, self.grid_shape, len(geometry.ages))
+        planes = 2 if look_ahead else 1
+        self._operator = operator
         self._state = allocate_state(
-            encoder.geometry,
-            self._operator,
-            resolution,
-            origin_us=checked_time(origin_us),
-            planes=2 if look_ahead else 1,
-            threads=threads,
+            geometry.newest, operator, resolution, origin_us=origin, planes=planes, threads=threads
         )
+        self._past = Past(geometry, operator, resolution, origin) if len(geometry.ages) > 1 else None
         self._further = [
             (place, Engine(scale, resolution, origin_us=origin_us, look_ahead=look_ahead, threads=threads))
             for place, scale in zip(encoder.places[1:], encoder.further, strict=True)
@@ -125,7 +123,8 @@ class Engine(Shown):
             InputError: not such an array, or one whose polarities mean nobody knows what.
         """
         events = self._checked(batch)
-        count_events(events, self._operator, self._state)
+        for run in self._runs(events, singly=False):
+            count_events(run, self._operator, self._state)
         for _, scale in self._further:
             scale.feed(events)
 
@@ -142,8 +141,9 @@ class Engine(Shown):
             InputError: as for `feed`.
         """
         events = self._checked(batch)
-        self._update()
-        follow(events, self._operator, self._state)
+        for run in self._runs(events, singly=True):
+            self._update()
+            follow(run, self._operator, self._state)
         for _, scale in self._further:
             scale.follow(events)
 
@@ -160,12 +160,44 @@ class Engine(Shown):
             InputError: as for `feed`.
         """
         events = self._checked(batch)
-        self._update()
         if not self.encoder.further:
-            return trace_events(events, self._operator, self._state, weights, keep_features=keep_features)
-        first = trace_events(events, self._operator, self._state, None)
+            return self._traced(events, weights, keep_features=keep_features)
+        first = self._traced(events, None)
         scales = [(place, scale.trace(events)) for place, scale in self._further]
         return joined(first, scales, self.encoder.n_features, weights, keep_features=keep_features)
+
+    def _traced(self, events: Events, weights: Weights | None, *, keep_features: bool = True) -> Trace:
+        """The trace of the first scale."""
+        found = []
+        for run in self._runs(events, singly=True):
+            self._update()
+            one = trace_events(run, self._operator, self._state, weights, keep_features=keep_features)
+            if self._past and len(run):  # whose volumes see only a part of the events
+                one.accepted[:] += self.n_events - one.accepted[-1]
+            found.append(one)
+        return found[0] if len(found) == 1 else Trace(*map(np.concatenate, zip(*found, strict=True)))
+
+    def _runs(self, events: Events, *, singly: bool) -> Iterator[Events]:
+        """The events of a batch; where volumes are shorter than the window, bin by bin (see `Past.cut`)."""
+        if self._past is None:
+            yield events
+            return
+        for run in self._past.cut(events, singly=singly):
+            self._turn_to(run.bin)
+            self._past.count(run)
+            yield run.events
+
+    def _turn_to(self, new: int) -> None:
+        """Make a bin the current one, if it is later; all events of the bins before are in."""
+        state = self._state
+        if new <= state.clock[CLOCK_NOW]:
+            return
+        if self._past:
+            if is_complete(self._operator, state):
+                update_plane(self._operator, state, self._crew)
+                self._past.keep(state)
+            self._past.advance(new)
+        advance_to_bin(new, self._operator, state)
 
     @one_thread
     def prepare(self, columns: int) -> bool:
@@ -185,35 +217,10 @@ class Engine(Shown):
         return bool(left > 0) and all(scale.prepare(columns) for _, scale in self._further)
 
     def _update(self) -> None:
-        """Bring the current plane up to date; asks first, for each call of a kernel costs 6 us by itself."""
-        operator, state, crew = self._operator, self._state, self._crew
-        if self._is_complete and not state.clock[CLOCK_TOUCHED]:
-            return
-        filters = operator.offset.shape[0]
-        mark_dirty(operator, state)
-        renewing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
-        crew.share(renew, renewing, operator, state)
-        settle(state)
-        list_missing(operator, state)
-        completing = crew.parts_for(int(state.clock[CLOCK_DIRTY]) * filters)
-        crew.share(complete, completing, operator, state)
-        finish(max(renewing, completing), operator, state)
-
-    @property
-    def _is_complete(self) -> bool:
-        state = self._state
-        coded = state.cursors[state.clock[CLOCK_PLANE], CURSOR_CODED]
-        return bool(coded == self.grid_shape[0] * self.grid_shape[1])
-
-    @property
-    def _most_volumes(self) -> int:
-        """A bound of the volumes that an update has to work on."""
-        volumes = self.grid_shape[0] * self.grid_shape[1]
-        if not self._is_complete:
-            return volumes
-        covering = -((-self._operator.patch // self._operator.stride) ** 2)
-        touched = int(self._state.clock[CLOCK_TOUCHED])
-        return len(self._state.cursors) * min(volumes, touched * covering)
+        """Bring the current plane up to date."""
+        update_plane(self._operator, self._state, self._crew)
+        if self._past:
+            self._past.add(self._state)
 
     @staticmethod
     def _checked(batch: Events) -> Events:
@@ -233,16 +240,14 @@ class Engine(Shown):
             InputError: the time is beyond 2^62 microseconds.
         """
         since = checked_time(t_us) - int(self._state.clock[CLOCK_ORIGIN])
-        new = since // self._operator.bin_us
-        if new > self._state.clock[CLOCK_NOW]:
-            advance_to_bin(new, self._operator, self._state)
+        self._turn_to(since // self._operator.bin_us)
         for _, scale in self._further:
             scale.advance(t_us)
 
     @one_thread
     def features(self) -> NDArray[np.float32]:
         """The pooled codes of the current window, a copy: `(n_features,)` float32."""
-        if self._crew.is_worth_counting(self._most_volumes * self._operator.offset.shape[0]):
+        if self._past or is_worth_sharing(self._operator, self._state, self._crew):
             self._update()
         features = np.zeros(self.encoder.n_features, np.float32)
         read(self._operator, self._state, features[: n_features(self._operator)])
@@ -252,8 +257,8 @@ class Engine(Shown):
 
     @one_thread
     def codes(self) -> NDArray[np.float32]:
-        """The code of every local volume of the first scale, a copy: `(rows, columns, K)` float32, before any
-        split.
+        """The code of every local volume of the first scale that ends with the current bin, a copy:
+        `(rows, columns, K)` float32, before any split.
         """
         self._update()
         state, operator = self._state, self._operator
@@ -271,12 +276,17 @@ class Engine(Shown):
         """The signed counts of the current window in the first scale's ring, a copy: `(n_bins, H, W)` int32,
         the oldest bin first, not clipped.
         """
-        return np.roll(self._state.counts, -1 - int(self._state.clock[CLOCK_SLOT]), axis=0)
+        return np.roll(self._window.counts, -1 - int(self._window.clock[CLOCK_SLOT]), axis=0)
+
+    @property
+    def _window(self) -> State:
+        """The state that holds the counts of the whole window, and the tally."""
+        return self._past.window if self._past else self._state
 
     @one_thread
     def activity(self) -> NDArray[np.int64]:
-        """The sum of squared entries of every local volume of the first scale, a copy: `(rows, columns)`
-        int64; 0 is empty.
+        """The sum of squared entries of every local volume of the first scale that ends with the current bin,
+        a copy: `(rows, columns)` int64; 0 is empty.
         """
         self._update()
         squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
@@ -292,12 +302,17 @@ class Engine(Shown):
     @property
     def n_events(self) -> int:
         """Events accepted and counted, as in `stats()`."""
-        return int(self._state.tally[TALLY_EVENTS])
+        return int(self._window.tally[TALLY_EVENTS])
+
+    @property
+    def _encoded(self) -> int:
+        """Volumes of the first scale encoded so far."""
+        return int(self._state.encoded.sum()) + (self._past.encoded if self._past else 0)
 
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
-        events, late, rejected, saturated, rolls = (int(value) for value in self._state.tally)
-        encoded = int(self._state.encoded.sum())
+        events, late, rejected, saturated, rolls = (int(value) for value in self._window.tally)
+        encoded = self._encoded
         plane = self._state.clock[CLOCK_PLANE]
         active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
         for seen in [scale.stats() for _, scale in self._further]:
@@ -311,15 +326,10 @@ class Engine(Shown):
         Raises:
             InputError: the origin is beyond 2^62 microseconds.
         """
-        state, origin = self._state, checked_time(origin_us)
-        state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
-        for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
-            array[:] = 0
-        state.pooled[:] = 0
-        state.cursors[:] = 0
-        state.clock[:] = 0
-        state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
-        state.clock[CLOCK_ORIGIN] = origin
+        origin = checked_time(origin_us)
+        clear_state(self._state, origin)
+        if self._past:
+            self._past.restart(origin)
         for _, scale in self._further:
             scale.restart(origin)
 
@@ -339,15 +349,17 @@ class Engine(Shown):
             state.atoms[np.arange(len(state.atoms)) != state.clock[CLOCK_PLANE]] = 0
             state.cursors[:] = 0
             state.pooled[:] = 0
+            if self._past:
+                self._past.forget()
             self._update()
         return Snapshot(
             fingerprint=self.encoder.fingerprint,
-            counts=state.counts.copy(),
+            counts=self._window.counts.copy(),
             atoms=atoms,
             bin=int(state.clock[CLOCK_NOW]),
             origin_us=int(state.clock[CLOCK_ORIGIN]),
-            tally=state.tally.copy(),
-            encoded=np.array([state.encoded.sum(), 0]),
+            tally=self._window.tally.copy(),
+            encoded=np.array([self._encoded, 0]),
             further=tuple(scale.snapshot() for _, scale in self._further),
         )
 
@@ -361,27 +373,24 @@ class Engine(Shown):
                 nothing has changed.
         """
         self._check(snapshot)
-        state, limit = self._state, self._operator.max_count
+        state, operator = self._state, self._operator
         codes = state.atoms[0, :, CODE]  # a restart begins with plane 0
         self.restart(snapshot.origin_us)
-        state.counts[:] = snapshot.counts
-        state.applied[:] = snapshot.counts.clip(-limit, limit)
+        enter_counts(snapshot.counts, snapshot.bin, operator, self._window)
+        if self._past:
+            enter_counts(self._past.newest_counts(), snapshot.bin, operator, state)
         codes[:] = snapshot.atoms
-        if snapshot.bin > BEFORE_TIME:
-            state.clock[CLOCK_NOW] = snapshot.bin
-            state.clock[CLOCK_START] = snapshot.origin_us + snapshot.bin * self._operator.bin_us
-            state.clock[CLOCK_SLOT] = snapshot.bin % len(state.counts)
         # Before time moves on: lasso codes are kept of volumes only that are not empty.
-        self._update()
+        update_plane(operator, state, self._crew)
         codes[state.moments[0, :, MOMENT_SQUARES] == 0] = 0
-        state.tally[:] = snapshot.tally
+        self._window.tally[:] = snapshot.tally
         state.encoded[:] = 0
-        state.encoded[0] = snapshot.encoded.sum()
+        state.encoded[0] = snapshot.encoded.sum() - (self._past.encoded if self._past else 0)
         for (_, scale), further in zip(self._further, snapshot.further, strict=True):
             scale.restore(further)
 
     def _check(self, snapshot: Snapshot) -> None:
-        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state)
+        check_snapshot(snapshot, self.encoder.fingerprint, self._operator, self._state, self._window.counts)
         check_further(snapshot, len(self._further))
         for (_, scale), further in zip(self._further, snapshot.further, strict=True):
             scale._check(further)

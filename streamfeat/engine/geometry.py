@@ -3,7 +3,9 @@
 Lives here: patch, stride, bins and the grids that follow from them. Not here: what is learned.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from streamfeat.errors import InputError
 from streamfeat.events import Resolution
@@ -11,7 +13,11 @@ from streamfeat.events import Resolution
 __all__ = ["Geometry"]
 
 
-@dataclass(frozen=True, slots=True)
+_LATER = ("volume_bins", "time_stride")
+"""Fields that the first files do not have; they are not written where they have their defaults."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Geometry:
     """Where local volumes lie in space and time.
 
@@ -24,9 +30,13 @@ class Geometry:
         max_count: counts are clipped to `[-max_count, max_count]`.
         pooling: cells along each side of the grid of volumes; codes are summed over each cell. Two is the
             paper's: four quadrants.
+        volume_bins: bins of a local volume; None for all of the window. Fewer (3D convolution) make volumes
+            lie in time, too: they end with the current bin and every `time_stride` bins before it, as many as
+            fit into the window, and their codes are summed over time as over each cell.
+        time_stride: bins between volumes at the same place; 1 where `volume_bins` is None.
 
     Raises:
-        InputError: a value is out of range.
+        InputError: a value is out of range, or a volume does not fit into the window.
     """
 
     patch: int = 12
@@ -36,6 +46,8 @@ class Geometry:
     downsample: int = 1
     max_count: int = 1
     pooling: int = 2
+    volume_bins: int | None = None
+    time_stride: int = 1
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -52,11 +64,64 @@ class Geometry:
             value = getattr(self, name)
             if not (type(value) is int and 1 <= value <= most):
                 raise InputError(f"geometry: {name} is {value!r}, it must be an integer from 1 to {most}")
+        self._check_time()
+
+    def _check_time(self) -> None:
+        """Check what volumes are in time; those as long as the window have one spelling."""
+        bins = self.n_bins if self.volume_bins is None else self.volume_bins
+        if not (type(bins) is int and 1 <= bins <= self.n_bins):
+            raise InputError(
+                f"geometry: volume_bins is {bins!r}, it must be an integer from 1 to the "
+                f"{self.n_bins} bins of the window"
+            )
+        most = max(self.n_bins - bins, 1)
+        if not (type(self.time_stride) is int and 1 <= self.time_stride <= most):
+            raise InputError(
+                f"geometry: time_stride is {self.time_stride!r}, it must be an integer from 1 to {most}: "
+                f"volumes have {bins} of the {self.n_bins} bins of the window"
+            )
+        if bins == self.n_bins:
+            object.__setattr__(self, "volume_bins", None)
+
+    def __repr__(self) -> str:
+        """All that a file holds; encoders and their fingerprints are told apart by it."""
+        return f"Geometry({', '.join(f'{name}={value!r}' for name, value in self.as_dict().items())})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Names and values as a file holds them."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        defaults = {field.name: field.default for field in fields(self) if field.name in _LATER}
+        return {n: value for n, value in values.items() if n not in _LATER or value != defaults[n]}
+
+    @property
+    def is_general(self) -> bool:
+        """Whether the first files could not hold it."""
+        return not self.as_dict().keys().isdisjoint(_LATER)
+
+    @property
+    def depth(self) -> int:
+        """Bins of a volume."""
+        return self.n_bins if self.volume_bins is None else self.volume_bins
+
+    @property
+    def ages(self) -> Sequence[int]:
+        """By how many bins the volumes at one place end before the current one; the newest is of age 0."""
+        return range(0, self.n_bins - self.depth + 1, self.time_stride)
+
+    @property
+    def newest(self) -> "Geometry":
+        """That of the volumes which end with the current bin: a window of as many bins as they have."""
+        return replace(self, n_bins=self.depth, volume_bins=None, time_stride=1)
+
+    @property
+    def whole(self) -> "Geometry":
+        """That of volumes as long as the window."""
+        return replace(self, volume_bins=None, time_stride=1)
 
     @property
     def entries(self) -> int:
         """Length `d` of a volume."""
-        return self.n_bins * self.patch * self.patch
+        return self.depth * self.patch * self.patch
 
     @property
     def window_us(self) -> int:

@@ -237,18 +237,19 @@ def _largest_code(operator: Operator) -> float:
     return z
 
 
-def with_fixed_point(operator: Operator, grid_shape: tuple[int, int]) -> Operator:
+def with_fixed_point(operator: Operator, grid_shape: tuple[int, int], times: int = 1) -> Operator:
     """The operator of one sensor: its grid, and codes in units of the finest fixed point that it allows.
 
     Args:
         operator: in units of one.
         grid_shape: rows and columns of volumes; those of one cell share a sum.
+        times: volumes at each place, one behind the other in time; they share a sum, too.
 
     Raises:
         InputError: the pooled sums could overflow whatever the fixed point.
     """
     rows, columns = grid_shape
-    volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling)
+    volumes = -(-rows // operator.pooling) * -(-columns // operator.pooling) * times
     if operator.steps is not None:
         return with_narrow_codes(operator, volumes)._replace(shape=grid_shape)
     unit = 2.0 ** _fixed_point_bits(operator, volumes)

@@ -53,7 +53,9 @@ def checked_time(t_us: int) -> int:
     return int(t_us)
 
 
-def check_snapshot(snapshot: Snapshot, fingerprint: str, operator: Operator, state: State) -> None:
+def check_snapshot(
+    snapshot: Snapshot, fingerprint: str, operator: Operator, state: State, counts: NDArray[np.int32]
+) -> None:
     """Check that an engine can go on from a snapshot; it may come from anywhere.
 
     Args:
@@ -61,6 +63,7 @@ def check_snapshot(snapshot: Snapshot, fingerprint: str, operator: Operator, sta
         fingerprint: of the engine's encoder.
         operator: of the engine.
         state: of the engine, not changed.
+        counts: of the engine's whole window, not changed.
 
     Raises:
         InputError: the snapshot is of another encoder or another resolution, or of no engine at all.
@@ -70,7 +73,7 @@ def check_snapshot(snapshot: Snapshot, fingerprint: str, operator: Operator, sta
             f"the snapshot is of encoder {snapshot.fingerprint[:12]}, this engine has {fingerprint[:12]}"
         )
     encoded = np.zeros(2, np.int64)
-    mine: tuple[NDArray[Any], ...] = (state.counts, state.atoms[0, :, CODE], state.tally, encoded)
+    mine: tuple[NDArray[Any], ...] = (counts, state.atoms[0, :, CODE], state.tally, encoded)
     for name, array in zip(("counts", "atoms", "tally", "encoded"), mine, strict=True):
         given = getattr(snapshot, name)
         if given.dtype != array.dtype or given.shape != array.shape:

@@ -15,7 +15,9 @@ from streamfeat.kernels.layout import (
     BEFORE_TIME,
     CLOCK_NOW,
     CLOCK_ORIGIN,
+    CLOCK_SLOT,
     CLOCK_START,
+    MOMENT_SQUARES,
     QUEUE,
     SPLIT,
     Operator,
@@ -23,7 +25,7 @@ from streamfeat.kernels.layout import (
 )
 from streamfeat.kernels.vectors import MASK_BITS
 
-__all__ = ["allocate_state"]
+__all__ = ["allocate_state", "clear_state", "enter_counts"]
 
 
 def allocate_state(
@@ -99,6 +101,35 @@ def allocate_state(
         changes=np.zeros((threads, geometry.entries + 1), np.int16),
         corners=np.zeros((threads, atoms * padded), np.float32),
     )
+
+
+def clear_state(state: State, origin_us: int) -> None:
+    """Make a state that of an engine without events whose bin 0 starts at `origin_us`; tallies stay."""
+    state.projections[state.moments[:, :, MOMENT_SQUARES] != 0] = 0
+    for array in (state.counts, state.applied, state.is_touched, state.moments, state.atoms):
+        array[:] = 0
+    state.pooled[:] = 0
+    state.cursors[:] = 0
+    state.clock[:] = 0
+    state.clock[[CLOCK_NOW, CLOCK_START]] = BEFORE_TIME
+    state.clock[CLOCK_ORIGIN] = origin_us
+
+
+def enter_counts(counts: NDArray[np.int32], now: int, operator: Operator, state: State) -> None:
+    """Give a cleared state the counts of a window; planes follow with the next update.
+
+    Args:
+        counts: `(T, H, W)`, bin `b` in slot `b % T`.
+        now: the current bin.
+        operator: limit of counts, length of a bin.
+        state: changed.
+    """
+    state.counts[:] = counts
+    state.applied[:] = counts.clip(-operator.max_count, operator.max_count)
+    if now > BEFORE_TIME:
+        state.clock[CLOCK_NOW] = now
+        state.clock[CLOCK_START] = state.clock[CLOCK_ORIGIN] + now * operator.bin_us
+        state.clock[CLOCK_SLOT] = now % len(counts)
 
 
 def _cells(pooling: int, rows: int, columns: int) -> NDArray[np.int32]:

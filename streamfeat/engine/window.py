@@ -12,10 +12,10 @@ from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.state import allocate_state
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.kernels.encode import read_features
-from streamfeat.kernels.layout import CLOCK_SLOT, Operator
+from streamfeat.kernels.layout import CLOCK_SLOT, Operator, State
 from streamfeat.kernels.planes import ALONE, FIRST, complete, finish, list_missing
 
-__all__ = ["count_window", "encode_window"]
+__all__ = ["add_volumes", "count_window", "encode_window"]
 
 
 def count_window(
@@ -56,6 +56,23 @@ def count_window(
     return counts.clip(-geometry.max_count, geometry.max_count).astype(np.int16).reshape(ring)
 
 
+def add_volumes(counts: NDArray[np.int16], operator: Operator, state: State) -> None:
+    """Encode the volumes of some bins, and add them to the pooled sums of a state that keeps no projections.
+
+    Args:
+        counts: `(depth, H, W)` clipped, oldest bin first.
+        operator: with the fixed point of the sensor.
+        state: all but its pooled sums is overwritten.
+    """
+    state.applied[:] = counts
+    state.clock[CLOCK_SLOT] = len(counts) - 1  # the volumes end with the last slot
+    state.cursors[:] = 0
+    state.atoms[:] = 0  # codes of the lasso follow from the counts alone
+    list_missing(operator, state)
+    complete(FIRST, ALONE, operator, state)
+    finish(ALONE, operator, state)
+
+
 def encode_window(
     geometry: Geometry,
     operator: Operator,
@@ -65,13 +82,11 @@ def encode_window(
     t_us: int | None = None,
 ) -> NDArray[np.float32]:
     """Features of one window; see `Encoder.encode`."""
-    pooling = with_fixed_point(operator, geometry.grid_shape(resolution))
-    state = allocate_state(geometry, pooling, resolution, keep=False)
-    state.applied[:] = count_window(geometry, events, resolution, origin_us, t_us)
-    state.clock[CLOCK_SLOT] = geometry.n_bins - 1  # the window ends with the last slot
-    list_missing(pooling, state)
-    complete(FIRST, ALONE, pooling, state)
-    finish(ALONE, pooling, state)
+    pooling = with_fixed_point(operator, geometry.grid_shape(resolution), len(geometry.ages))
+    state = allocate_state(geometry.newest, pooling, resolution, keep=False)
+    counts = count_window(geometry, events, resolution, origin_us, t_us)
+    for age in geometry.ages:
+        add_volumes(counts[len(counts) - geometry.depth - age : len(counts) - age], pooling, state)
     features = np.empty(n_features(pooling), np.float32)
     read_features(pooling, state, features)
     return features

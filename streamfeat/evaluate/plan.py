@@ -167,7 +167,7 @@ def parse_sweep(text: str) -> tuple[str, list[Any]]:
     name = name.strip().replace("-", "_")
     if name not in SWEPT:
         raise InputError(f"--sweep {text}: {name!r} cannot be swept; choose one of {', '.join(SWEPT)}")
-    parse, such_as = _KINDS[type(_DEFAULTS[name])]
+    parse, such_as = _KINDS[int if name == "volume_bins" else type(_DEFAULTS[name])]
     try:
         return name, list(dict.fromkeys(parse(part.strip()) for part in values.split(",")))
     except (ValueError, KeyError):

@@ -69,7 +69,18 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 def _geometry(setting: dict[str, Any]) -> str:
     first = f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    if setting.get("volume_bins"):
+        first = first.replace(f"x{setting['bins']}/", f"x{setting['volume_bins']}/")
     return first if setting["scales"] == "none" else f"{first}+{setting['scales']}"
+
+
+def _times(setting: dict[str, Any]) -> str:
+    if not setting.get("volume_bins"):
+        return ""
+    return (
+        f"volumes of {setting['volume_bins']} of {setting['bins']} bins, {setting['time_stride']} apart in "
+        "time, codes summed over it; "
+    )
 
 
 def _shape(learned: dict[str, Any]) -> str:
@@ -241,6 +252,7 @@ def notes(result: dict[str, Any]) -> list[str]:
     if setting:
         lines.append(
             "Geometry is patch x patch x bins/stride, in pixels, and further scales, each patch@downsample; "
+            f"{_times(setting)}"
             f"downsample {setting['downsample']}, counts "
             f"clipped to {setting['max_count']}, {setting['encoding']} encoding, "
             f"{setting['volumes']:,} volumes, seed {setting['seed']}. "

@@ -55,6 +55,7 @@ class Model:
             "patch": geometry.patch,
             "stride": geometry.stride,
             "bins": geometry.n_bins,
+            "volume_bins": geometry.depth,
             "bin_us": geometry.bin_us,
             "downsample": geometry.downsample,
             "scales": len(encoder.scales),

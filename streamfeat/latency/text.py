@@ -42,9 +42,10 @@ def describe(model: Model | Method) -> str:
     m = model.describe()
     if "method" in m:
         return f"{m['model']}: {m['method']}"
+    short = "" if m["volume_bins"] == m["bins"] else f"volumes of {m['volume_bins']} of "
     return (
         f"{m['model']}: {m['formulation']}, {m['encoding']}, K = {m['filters']}, patch {m['patch']}, "
-        f"stride {m['stride']}, {m['bins']} bins of {m['bin_us'] / 1000:g} ms"
+        f"stride {m['stride']}, {short}{m['bins']} bins of {m['bin_us'] / 1000:g} ms"
     )
 
 

@@ -201,6 +201,8 @@ def geometries_of(
                 stride=other.stride,
                 downsample=other.downsample,
                 n_bins=other.bins,
+                volume_bins=other.volume_bins,
+                time_stride=other.time_stride,
             )
             for other in others
         ),

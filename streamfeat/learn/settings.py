@@ -62,6 +62,9 @@ class Setting:
         downsample: sensor pixels along each side of a ring pixel.
         max_count: counts are clipped to `[-max_count, max_count]`.
         pooling: cells along each side of the grid of volumes; codes are summed over each cell.
+        volume_bins: bins of a local volume; None for all of the window. Codes of shorter ones are summed over
+            time, too. A further scale of no more bins than that has volumes as long as its window.
+        time_stride: bins between volumes at the same place; 1 where `volume_bins` is None.
         lambda0: sparsity penalty in learning; None for that of `LAMBDAS`.
         threshold: of encoding, in units of unit-length filters.
         start: of learning, `kmeans` or `random`.
@@ -90,6 +93,8 @@ class Setting:
     downsample: int = 1
     max_count: int = 1
     pooling: int = 2
+    volume_bins: int | None = None
+    time_stride: int = 1
     lambda0: float | None = None
     threshold: float = THRESHOLD
     start: str = "kmeans"
@@ -105,6 +110,7 @@ class Setting:
     def __post_init__(self) -> None:
         """Check what can be checked without a recording."""
         from streamfeat.engine.encoder import Encoding, Formulation
+        from streamfeat.engine.geometry import Geometry
 
         for name, kind in (("formulation", Formulation), ("encoding", Encoding)):
             if getattr(self, name) not in get_args(kind):
@@ -135,7 +141,8 @@ class Setting:
                 raise InputError(f"{name} is a weight for filters of any length; give --rows free with it")
         if self.volumes < 2 or self.iterations < 1 or self.filters < 1:
             raise InputError("at least two volumes, one iteration and one filter are needed to learn")
-        entries = self.bins * self.patch * self.patch
+        times = Geometry(n_bins=self.bins, volume_bins=self.volume_bins, time_stride=self.time_stride)
+        entries = times.depth * self.patch * self.patch
         if self.volumes < max(self.filters, entries + 1):
             raise InputError(
                 f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
@@ -165,12 +172,17 @@ class Setting:
             raise InputError(
                 f"scale {text!r} has more bins than the {self.bins} of the first; give those to it"
             )
+        fewer = self.bins if bins is None else bins
+        depth = self.volume_bins or fewer
+        is_short = depth < fewer
         return replace(
             self,
+            volume_bins=depth if is_short else None,
+            time_stride=min(self.time_stride, fewer - depth) if is_short else 1,
             patch=patch,
             stride=self.stride if stride is None else stride,
             downsample=1 if downsample is None else downsample,
-            bins=self.bins if bins is None else bins,
+            bins=fewer,
             scales="none",
         )
 

@@ -174,14 +174,16 @@ def _draw_from(
     origin = window.origin_us % (1 << 64)  # a generator's seed is not negative
     rng = np.random.default_rng([*seed, origin, len(window.events)])
     counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
-    places = sliding_window_view(counts, (geometry.patch, geometry.patch), axis=(1, 2))
+    places = sliding_window_view(counts, (geometry.depth, geometry.patch, geometry.patch))
     keys = rng.integers(0, KEYS, per_window)
-    rows = rng.integers(0, places.shape[1], (_TRIES, per_window))
-    columns = rng.integers(0, places.shape[2], (_TRIES, per_window))
+    tries = (_TRIES, per_window)
+    rows, columns = rng.integers(0, places.shape[1], tries), rng.integers(0, places.shape[2], tries)
+    # A window of one volume takes no number from the generator.
+    bins = rng.integers(0, places.shape[0], tries) if places.shape[0] > 1 else np.zeros(tries, np.int64)
 
     def cut(tried: int, wanted: NDArray[np.int64]) -> NDArray[Any]:
-        found = places[:, rows[tried, wanted], columns[tried, wanted]]
-        return found.transpose(1, 0, 2, 3).reshape(len(wanted), geometry.entries)
+        found: NDArray[Any] = places[bins[tried, wanted], rows[tried, wanted], columns[tried, wanted]]
+        return found.reshape(len(wanted), geometry.entries)
 
     shown = np.arange(min(per_window, _SHOWN))
     n_empty = int(np.count_nonzero(~cut(0, shown).any(axis=1)))

@@ -58,20 +58,20 @@ def _described(shown: Any) -> tuple[str, dict[str, Any]]:
 def _encoder(encoder: Any) -> dict[str, Any]:
     g = encoder.geometry
     filters = f"{encoder.n_filters:,} {'filters' if encoder.formulation == 'direct' else 'atoms'}"
-    volume = f"{g.n_bins}x{g.patch}x{g.patch}"
+    volume = f"{g.depth}x{g.patch}x{g.patch}"
     rows = {
         "formulation": encoder.formulation,
         "encoding": f"{encoder.encoding}, threshold {encoder.threshold:g}",
         "filters": f"{filters} of {volume} (bins, rows, columns)",
-        "window": f"{g.n_bins} bins of {g.bin_us / 1000:g} ms",
+        "window": f"{g.n_bins} bins of {g.bin_us / 1000:g} ms{_times(g)}",
         "volumes": f"stride {g.stride}, downsample {g.downsample}, counts up to {g.max_count}",
         "features": f"{encoder.n_features:,} in {g.pooling}x{g.pooling} cells",
         "state": "narrow, sums of 16 bits" if encoder.is_narrow else "wide, sums of 32 bits",
         "learned from": ", ".join(map(str, encoder.provenance.get("recordings", []))) or "unknown",
     }
-    shown = encoder.filters[:_MOST_FILTERS].reshape(-1, g.n_bins, g.patch, g.patch)
+    shown = encoder.filters[:_MOST_FILTERS].reshape(-1, g.depth, g.patch, g.patch)
     # Bins beside each other, the oldest on the left.
-    images = shown.transpose(0, 2, 1, 3).reshape(len(shown), g.patch, g.n_bins * g.patch)
+    images = shown.transpose(0, 2, 1, 3).reshape(len(shown), g.patch, g.depth * g.patch)
     line = [encoder.formulation, encoder.encoding, *["narrow"] * encoder.is_narrow]
     line += [f"{filters} of {volume}", f"{g.window_us / 1000:g} ms"]
     return {
@@ -80,6 +80,12 @@ def _encoder(encoder: Any) -> dict[str, Any]:
         "picture": mosaic(images),
         "caption": f"the first {len(shown)} filters, bins side by side",
     }
+
+
+def _times(geometry: Any) -> str:
+    if geometry.depth == geometry.n_bins:
+        return ""
+    return f"; volumes of {geometry.depth}, {geometry.time_stride} apart, summed over time"
 
 
 def _engine(engine: Any) -> dict[str, Any]:

@@ -201,6 +201,7 @@ def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
         "patch": str(geometry.patch),
         "stride": str(geometry.stride),
         "bins": str(geometry.n_bins),
+        "volume_bins": str(geometry.depth),
         "bin_us": str(geometry.bin_us),
         "max_count": str(geometry.max_count),
         "downsample": str(geometry.downsample),

@@ -32,6 +32,7 @@ MARKING = "tests/test_kernels.py -k 'mark_dirty or update or settle'"
 INGEST = "tests/test_kernels.py -k 'count_event or advance_to_bin'"
 SESSION = "tests/test_session.py"
 SHARD = "tests/test_live_shard.py -k share"
+SHORT = "tests/test_volume_bins.py"
 RECORDING = "tests/test_recording.py"
 
 MUTANTS = [
@@ -204,6 +205,69 @@ MUTANTS = [
         "            state.atoms[np.arange(len(state.atoms)) != state.clock[CLOCK_PLANE]] = 0\n",
         "",
         "tests/test_state.py -k 'codes_of_a_snapshot_alone'",
+    ),
+    Mutant(
+        "sums of a bin that is over stay after a belated event",
+        "engine/past.py",
+        "< number + self._geometry.depth)] = _NO_BIN",
+        "< number + 1)] = _NO_BIN",
+        SHORT,
+    ),
+    Mutant(
+        "what earlier bins are worth is added twice",
+        "engine/past.py",
+        "+= self._added - before",
+        "+= self._added",
+        SHORT,
+    ),
+    Mutant(
+        "sums of a bin are kept with those of the bins before",
+        "engine/past.py",
+        "sums - self._added_to(now), now",
+        "sums, now",
+        SHORT,
+    ),
+    Mutant(
+        "a bin is kept that was not brought up to date",
+        "engine/engine.py",
+        "                update_plane(self._operator, state, self._crew)\n                self._past",
+        "                self._past",
+        SHORT,
+    ),
+    Mutant(
+        "an event of an earlier bin is followed together with others",
+        "engine/past.py",
+        "            is_cut |= is_over\n",
+        "",
+        SHORT,
+    ),
+    Mutant(
+        "a trace counts the events that newest volumes see",
+        "engine/engine.py",
+        "            if self._past and len(run):",
+        "            if False:",
+        SHORT,
+    ),
+    Mutant(
+        "a snapshot goes on with sums that were found on the way",
+        "engine/engine.py",
+        "                self._past.forget()\n",
+        "                pass\n",
+        SHORT,
+    ),
+    Mutant(
+        "counts of one volume begin a bin later",
+        "engine/past.py",
+        "np.arange(number - self._geometry.depth + 1, number + 1)",
+        "np.arange(number - self._geometry.depth + 2, number + 2)",
+        SHORT,
+    ),
+    Mutant(
+        "volumes are learned from the oldest bins only",
+        "learn/volumes.py",
+        "bins = rng.integers(0, places.shape[0], tries) if places.shape[0] > 1 else np.zeros(tries, np.int64)",
+        "bins = np.zeros(tries, np.int64)",
+        SHORT,
     ),
     # stream
     Mutant(
