@@ -5,6 +5,7 @@ a kernel goes step by step, it is a condition on one step, from the state that t
 """
 
 import inspect
+import math
 from types import SimpleNamespace
 
 import naive
@@ -720,8 +721,8 @@ def _news(call):
             there = position - int(plane != state.clock[CLOCK_PLANE])
             for volume in range(rows * columns):
                 top, left = (index * operator.stride for index in divmod(volume, columns))
-                if top <= row < top + patch and left <= column < left + patch:
-                    entry = (there * patch + row - top) * patch + column - left
+                if top <= row < top + patch[0] and left <= column < left + patch[1]:
+                    entry = (there * patch[0] + row - top) * patch[1] + column - left
                     yield plane, volume, int(entry) if there >= 0 else None
 
 
@@ -843,10 +844,11 @@ PROJECT_VOLUME = FORMS | {
     "from the first entry, over what the row held": lambda call: call.start == 0 and not _is_empty(call),
     "from the middle": lambda call: call.start > 0,
     "ends at the most that was asked": lambda call: (
-        call.result[0] == call.most and call.result[1] < (_bins(call) - call.ahead) * call.operator.patch**2
+        call.result[0] == call.most
+        and call.result[1] < (_bins(call) - call.ahead) * math.prod(call.operator.patch)
     ),
     "ends with the volume": lambda call: (
-        call.result[1] == (_bins(call) - call.ahead) * call.operator.patch**2
+        call.result[1] == (_bins(call) - call.ahead) * math.prod(call.operator.patch)
     ),
     "nothing to let in": lambda call: call.result[0] == 0,
     "ahead": lambda call: call.ahead == 1,
@@ -922,8 +924,8 @@ def _covering(call):
     patch, stride = operator.patch, operator.stride
     for volume in range(len(state.cells)):
         row, column = call.row - volume // columns * stride, call.column - volume % columns * stride
-        if 0 <= row < patch and 0 <= column < patch:
-            yield volume, ((call.position - 1) * patch + row) * patch + column
+        if 0 <= row < patch[0] and 0 <= column < patch[1]:
+            yield volume, ((call.position - 1) * patch[0] + row) * patch[1] + column
 
 
 def _partly_ahead(holds):
@@ -1007,7 +1009,7 @@ FOLLOW_EVENT = {
 
 
 def _line(call):
-    return call.patch**2
+    return math.prod(call.patch)
 
 
 GATHER_VOLUME = {
@@ -1015,9 +1017,11 @@ GATHER_VOLUME = {
     "the ring does not": lambda call: call.first_slot == 0,
     "all entries": lambda call: call.end == len(call.values),
     "none": lambda call: call.end == 0,
+    "a patch wider than it is tall": lambda call: call.patch[0] < call.patch[1] and call.start < call.end,
+    "a patch taller than it is wide": lambda call: call.patch[0] > call.patch[1] and call.start < call.end,
     "an end within a bin": lambda call: call.end % _line(call) > 0,
-    "lines that are copied entry by entry": lambda call: call.patch < 8 and call.start < call.end,
-    "lines of vectors that overlap": lambda call: call.patch > 8 and call.start < call.end,
+    "lines that are copied entry by entry": lambda call: call.patch[1] < 8 and call.start < call.end,
+    "lines of vectors that overlap": lambda call: call.patch[1] > 8 and call.start < call.end,
     "an end between bins": lambda call: 0 < call.end < len(call.values) and call.end % _line(call) == 0,
 }
 

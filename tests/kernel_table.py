@@ -377,8 +377,8 @@ def random_engine(rng, kinds=KINDS, narrow=None):
     )
     if geometry.entries == 1:
         geometry = Geometry(patch=2, stride=1, n_bins=1, bin_us=10)
-    smallest = geometry.patch * geometry.downsample
-    resolution = (int(smallest + rng.integers(0, 12)), int(smallest + rng.integers(0, 12)))
+    tall, wide = (side * geometry.downsample for side in geometry.sides)
+    resolution = (int(tall + rng.integers(0, 12)), int(wide + rng.integers(0, 12)))
     formulation, encoding = pick(rng, kinds)
     threshold = float(pick(rng, [0.02, 0.3]))
     n_filters = int(pick(rng, [1, 5, 32, 33]))
@@ -924,7 +924,7 @@ def rewind(rng, plane, operator, state):
     if projected < naive.volumes_of(operator) and rng.random() < 0.5:
         most = int(rng.integers(0, 9))
         _, following = naive.project_volume(plane, projected, ahead, 0, most, 0, operator, state)
-        end = (len(state.applied) - ahead) * operator.patch**2
+        end = (len(state.applied) - ahead) * math.prod(operator.patch)
         cursors[:] = (coded, projected + 1, 0) if following == end else (coded, projected, following)
     state.pooled[plane] = 0
     for row in range(coded):
@@ -1039,7 +1039,7 @@ def make_complete(rng):
 
 
 def make_count_filled(rng):
-    ring, _, _, _, patch, _ = random_place(rng)
+    ring, _, _, _, (_, patch), _ = random_place(rng)
     stride = int(rng.integers(1, 4))
     height, width = ring.shape[1:]
     crowds = np.zeros((height + 1, (width - patch) // stride + 1), np.int32)
@@ -1083,7 +1083,7 @@ def end_in_a_volume(rng, operator, state):
     r, c = int(pick(rng, rows)), int(pick(rng, columns))
     position = (slot - state.clock[CLOCK_SLOT] - 1) % len(state.counts) - (plane != state.clock[CLOCK_PLANE])
     inside = row - r * operator.stride, column - c * operator.stride
-    entry = int((position * operator.patch + inside[0]) * operator.patch + inside[1])
+    entry = int((position * operator.patch[0] + inside[0]) * operator.patch[1] + inside[1])
     volume = r * int(state.volume_columns.max()) + c
     end = int(pick(rng, [entry, entry + 1, rng.integers(1, len(operator.columns))]))
     state.cursors[plane] = min(int(state.cursors[plane, CURSOR_CODED]), volume), volume, max(end, 1)
@@ -1100,6 +1100,11 @@ def make_renew(rng):
     operator, state = engine_with_news(rng)
     naive.mark_dirty(operator, state)
     return *random_share(rng, state), operator, state
+
+
+def make_first_with_load(rng):
+    load = np.sort(rng.integers(0, 50, int(rng.integers(1, 12)))).astype(np.int32)
+    return int(rng.integers(0, 60)), load, int(rng.integers(0, len(load) + 1))
 
 
 def make_share_of_load(rng):
@@ -1135,10 +1140,10 @@ def near_the_end(rng, operator, state):
     _, volume, end = state.cursors[1 - int(state.clock[CLOCK_PLANE])].tolist()
     if end == 0:
         return None
-    area = operator.patch**2
+    area, width = math.prod(operator.patch), operator.patch[1]
     position, inside = divmod(int(pick(rng, [end - 1, end])) % ((len(state.counts) - 1) * area), area)
     top, left = (index * operator.stride for index in divmod(volume, int(state.volume_columns.max())))
-    return position + 1, top + inside // operator.patch, left + inside % operator.patch
+    return position + 1, top + inside // width, left + inside % width
 
 
 def changed_place(rng, operator, state):
@@ -1504,14 +1509,14 @@ def make_change_entries(rng):
 
 
 def random_place(rng):
-    """A ring of clipped counts, and where a volume lies in it."""
-    operator = random_engine(rng).encoder.operator
-    patch, d = operator.patch, len(operator.columns)
-    n_bins = d // patch**2
-    height, width = (patch + int(more) for more in rng.integers(0, 6, 2))
+    """A ring of clipped counts, and where a volume lies in it, which need not be a square."""
+    n_bins, rows, columns = int(rng.integers(1, 5)), int(rng.integers(1, 11)), int(rng.integers(1, 21))
+    patch = rows, columns if rng.random() < 0.7 else rows
+    d = n_bins * math.prod(patch)
+    height, width = (side + int(more) for side, more in zip(patch, rng.integers(0, 6, 2), strict=True))
     ring = rng.integers(-2, 3, (n_bins, height, width)).astype(np.int16)
     ring[rng.random(ring.shape) < rng.random()] = 0
-    top, left = int(rng.integers(0, height - patch + 1)), int(rng.integers(0, width - patch + 1))
+    top, left = int(rng.integers(0, height - patch[0] + 1)), int(rng.integers(0, width - patch[1] + 1))
     return ring, int(rng.integers(0, n_bins)), top, left, patch, d
 
 
@@ -1728,6 +1733,7 @@ KERNELS = [
     Row(planes.count_filled, make_count_filled, exact_but_lines),
     Row(planes.list_missing, make_list_missing, exact_list),
     Row(planes.share_of, make_share_of),
+    Row(planes.first_with_load, make_first_with_load),
     Row(planes.share_of_load, make_share_of_load),
     Row(planes.finish, make_finish),
     Row(planes.fill_plane, make_fill_plane, exact_but_atoms),

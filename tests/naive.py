@@ -581,8 +581,9 @@ def change_entries(n, entries, changes, values, operator, projection, moments, s
 
 def gather_volume(ring, first_slot, start, end, top, left, patch, values):
     oldest_first = np.roll(ring, -first_slot, axis=0)
-    volume = oldest_first[:, top : top + patch, left : left + patch].reshape(-1)
-    first, last = start // patch * patch, -(-end // patch) * patch  # whole lines
+    height, width = patch
+    volume = oldest_first[:, top : top + height, left : left + width].reshape(-1)
+    first, last = start // width * width, -(-end // width) * width  # whole lines
     values[first:last] = volume[first:last]
 
 
@@ -741,19 +742,19 @@ def queue_volume(plane, volume, n, part, operator, state):
 
 def _gather(ring, ahead, volume, operator, state):
     """Entries of a volume as they are after `ahead` more bins."""
-    n_bins, patch = len(ring), operator.patch
+    n_bins, (height, width) = len(ring), operator.patch
     top, left = (index * operator.stride for index in divmod(volume, operator.shape[1]))
     oldest_first = np.roll(ring, -slot_of(0, state), axis=0)
     bins = [*oldest_first[ahead:], *np.zeros_like(ring[:ahead])]
     assert len(bins) == n_bins
-    return np.array([pixels[top : top + patch, left : left + patch] for pixels in bins], int).ravel()
+    return np.array([pixels[top : top + height, left : left + width] for pixels in bins], int).ravel()
 
 
 def project_volume(plane, volume, ahead, start, most, part, operator, state):
     row = volume if state.projections.shape[1] > 1 else 0
     values = _gather(state.applied, ahead, volume, operator, state)
     (filled,) = np.nonzero(values[start:])
-    end = (len(state.applied) - ahead) * operator.patch**2
+    end = (len(state.applied) - ahead) * math.prod(operator.patch)
     following = int(start + filled[most]) if len(filled) > most else end
     values[following:] = 0
     state.projections[plane, row], state.moments[plane, row] = sums_of(values, operator)
@@ -831,6 +832,10 @@ def _filled_pixels(volume, operator, state):
     return int(windows.any(axis=0).sum())
 
 
+def first_with_load(least, load, n):
+    return next((i for i in range(n) if load[i] >= least), n)
+
+
 def share_of_load(part, parts, state):
     n = int(state.clock[CLOCK_DIRTY])
     load = state.load[: n + 1].astype(float)
@@ -884,7 +889,7 @@ def look_ahead(projected, coded, budget, operator, state):
         n, following = project_volume(plane, volume, 1, start, budget, part, operator, state)
         if held or _gather(state.applied, 0, volume, operator, state).any():
             budget -= 1 + n
-        if following == (len(state.applied) - 1) * operator.patch**2:
+        if following == (len(state.applied) - 1) * math.prod(operator.patch):
             volume, following = volume + 1, 0
         cursors[CURSOR_PROJECTED], cursors[CURSOR_ENTRY] = volume, following
     while budget > 0 and cursors[CURSOR_CODED] < min(coded, cursors[CURSOR_PROJECTED]):
@@ -1076,7 +1081,7 @@ def mark_cells(x, y, operator, state, is_stale):
     found = []
     for volume in range(volumes_of(operator)):
         top, left = (place * operator.stride for place in divmod(volume, operator.shape[1]))
-        if top <= row < top + operator.patch and left <= column < left + operator.patch:
+        if top <= row < top + operator.patch[0] and left <= column < left + operator.patch[1]:
             found.append(divmod(cell_index(volume, operator.shape, operator.pooling), operator.pooling))
     if found:  # a small grid leaves cells without a volume; those between others are marked, too
         (top, left), (bottom, right) = np.min(found, axis=0), np.max(found, axis=0)
@@ -1124,9 +1129,9 @@ def window_counts(events, geometry, resolution, origin_us, t_us):
 
 def local_volumes(counts, geometry):
     """`(rows, columns, d)` local volumes of a ring of counts."""
-    patch = geometry.patch
-    tops, lefts = (range(0, side - patch + 1, geometry.stride) for side in counts.shape[1:])
-    blocks = [[counts[:, i : i + patch, j : j + patch].reshape(-1) for j in lefts] for i in tops]
+    (height, width), (rows, columns) = geometry.sides, counts.shape[1:]
+    tops, lefts = (range(0, n + 1, geometry.stride) for n in (rows - height, columns - width))
+    blocks = [[counts[:, i : i + height, j : j + width].reshape(-1) for j in lefts] for i in tops]
     return np.array(blocks, np.float64)
 
 

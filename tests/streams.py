@@ -57,7 +57,7 @@ class Case:
 def cases(draw, kind, max_bins=4):
     formulation, encoding = kind
     geometry = Geometry(
-        patch=draw(st.integers(1, 4)),
+        patch=draw(st.sampled_from([1, 2, 3, 4, (1, 3), (4, 2), (2, 3)])),
         stride=draw(st.integers(1, 5)),
         n_bins=draw(st.integers(1, max_bins)),
         bin_us=draw(st.sampled_from([1, 7, 1000])),
@@ -65,11 +65,10 @@ def cases(draw, kind, max_bins=4):
         max_count=draw(st.sampled_from([1, 2, 3, 100])),
         pooling=draw(st.sampled_from([2, 1, 3, 5])),
     )
-    smallest = geometry.patch * geometry.downsample
-    side = st.integers(smallest, smallest + 11)
+    smallest = (side * geometry.downsample for side in geometry.sides)
     return Case(
         geometry,
-        (draw(side), draw(side)),
+        tuple(draw(st.integers(side, side + 11)) for side in smallest),
         draw(st.sampled_from([1, 5, 31, 32, 33])),
         formulation,
         encoding,

@@ -555,11 +555,14 @@ def test_a_terminal_shows_one_table_of_the_figures_of_the_metrics(files):
         plain_publisher(net, "cam/a/events") as camera,
     ):
         for i, events in enumerate(batches(20)):
+            if i == 10:  # the rate is that of half a second
+                until(lambda: "cam/a/events" in terminal.getvalue(), "the table")
+                time.sleep(0.5)
             if i != 7:
                 camera.put(message(events, i), attachment=attachment(i + 1, source_ns=time.time_ns()))
         camera.put(b"", attachment=attachment(21))
+        until(lambda: re.search(r"\+[0-9.]+ +[1-9][0-9,]* ", terminal.getvalue()), "a rate of events")
         until(lambda: job.result()["emissions"] >= 18 and job.result()["warnings"].get("bad packet"))
-        until(lambda: "cam/a/events" in terminal.getvalue(), "the table")
         plain = Console(file=io.StringIO(), width=120)
         plain.print(HealthTable(job.health))
         shown = plain.file.getvalue()

@@ -68,7 +68,13 @@ Filters = Annotated[
     int | None, typer.Option(help="Number of filters or atoms, K.", show_default=_shown("filters"))
 ]
 Patch = Annotated[
-    int | None, typer.Option(help="Pixels along a side of a local volume.", show_default=_shown("patch"))
+    str | None,
+    typer.Option(
+        metavar="PIXELS",
+        help="Pixels along a side of a local volume; ROWSxCOLUMNS such as 8x16; or sensor, for all of the "
+        "largest sensor.",
+        show_default=_shown("patch"),
+    ),
 ]
 Stride = Annotated[
     int | None, typer.Option(help="Pixels between neighbouring volumes.", show_default=_shown("stride"))

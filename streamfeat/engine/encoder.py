@@ -215,6 +215,8 @@ class Encoder(Shown):
                 continue  # of the sensor, columns again, or of the narrow state alone
             if name == "steps" and value is None:
                 continue  # of the narrow state, too
+            if name == "patch":
+                value = self.geometry.patch  # a number, where it is a square
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
         for scale in self.further:
             digest.update(scale.fingerprint.encode())

@@ -3,6 +3,7 @@
 Lives here: patch, stride, bins and the grids that follow from them. Not here: what is learned.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,6 +14,8 @@ from streamfeat.events import Resolution
 __all__ = ["Geometry"]
 
 
+_MOST_SIDE = 1024
+
 _LATER = ("volume_bins", "time_stride")
 """Fields that the first files do not have; they are not written where they have their defaults."""
 
@@ -22,7 +25,8 @@ class Geometry:
     """Where local volumes lie in space and time.
 
     Attributes:
-        patch: rows and columns of a local volume, in ring pixels.
+        patch: ring pixels along each side of a local volume, or `(rows, columns)`; equal ones have one
+            spelling, a number.
         stride: ring pixels between neighbouring volumes.
         n_bins: time bins in the window.
         bin_us: microseconds in a bin.
@@ -39,7 +43,7 @@ class Geometry:
         InputError: a value is out of range, or a volume does not fit into the window.
     """
 
-    patch: int = 12
+    patch: int | tuple[int, int] = 12
     stride: int = 2
     n_bins: int = 3
     bin_us: int = 33_334
@@ -52,7 +56,6 @@ class Geometry:
     def __post_init__(self) -> None:
         """Check every value."""
         upper = {
-            "patch": 1024,
             "stride": 1024,
             "n_bins": 1024,
             "bin_us": 2**40,
@@ -64,7 +67,18 @@ class Geometry:
             value = getattr(self, name)
             if not (type(value) is int and 1 <= value <= most):
                 raise InputError(f"geometry: {name} is {value!r}, it must be an integer from 1 to {most}")
+        self._check_patch()
         self._check_time()
+
+    def _check_patch(self) -> None:
+        """Check the sides of a volume; those that are equal have one spelling."""
+        sides = tuple(self.patch) if isinstance(self.patch, list | tuple) else (self.patch, self.patch)
+        if len(sides) != 2 or not all(type(side) is int and 1 <= side <= _MOST_SIDE for side in sides):
+            raise InputError(
+                f"geometry: patch is {self.patch!r}, it must be an integer from 1 to {_MOST_SIDE}, or two: "
+                "rows and columns"
+            )
+        object.__setattr__(self, "patch", sides[0] if sides[0] == sides[1] else sides)
 
     def _check_time(self) -> None:
         """Check what volumes are in time; those as long as the window have one spelling."""
@@ -96,7 +110,22 @@ class Geometry:
     @property
     def is_general(self) -> bool:
         """Whether the first files could not hold it."""
-        return not self.as_dict().keys().isdisjoint(_LATER)
+        return not (isinstance(self.patch, int) and self.as_dict().keys().isdisjoint(_LATER))
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of a volume."""
+        return (self.patch, self.patch) if isinstance(self.patch, int) else self.patch
+
+    @property
+    def patch_name(self) -> int | str:
+        """12, or `8x16`, as commands take it."""
+        return self.patch if isinstance(self.patch, int) else "x".join(map(str, self.patch))
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Bins, rows and columns of a volume."""
+        return self.depth, *self.sides
 
     @property
     def depth(self) -> int:
@@ -121,7 +150,7 @@ class Geometry:
     @property
     def entries(self) -> int:
         """Length `d` of a volume."""
-        return self.depth * self.patch * self.patch
+        return math.prod(self.volume_shape)
 
     @property
     def window_us(self) -> int:
@@ -133,14 +162,20 @@ class Geometry:
 
         A sensor smaller than a volume has pixels that never fire to its right and below it.
         """
-        height, width = (max(-(-side // self.downsample), self.patch) for side in resolution)
-        return height, width
+        (height, width), (rows, columns) = resolution, self.sides
+        return max(-(-height // self.downsample), rows), max(-(-width // self.downsample), columns)
+
+    @property
+    def smallest(self) -> Resolution:
+        """The smallest sensor that has room for a volume."""
+        rows, columns = self.sides
+        return rows * self.downsample, columns * self.downsample
 
     def has_room(self, resolution: Resolution) -> bool:
         """Whether a sensor of `(height, width)` pixels has a place for a volume without such pixels."""
-        return all(-(-side // self.downsample) >= self.patch for side in resolution)
+        return self.ring_shape(resolution) == tuple(-(-side // self.downsample) for side in resolution)
 
     def grid_shape(self, resolution: Resolution) -> tuple[int, int]:
         """Rows and columns of volumes for a sensor of `(height, width)` pixels; at least one of each."""
-        rows, columns = self.ring_shape(resolution)
-        return (rows - self.patch) // self.stride + 1, (columns - self.patch) // self.stride + 1
+        (rows, columns), (height, width) = self.ring_shape(resolution), self.sides
+        return (rows - height) // self.stride + 1, (columns - width) // self.stride + 1

@@ -34,7 +34,7 @@ def fixed_fields(
     inverse = formulation == "inverse" and kind != TRIANGLE
     atoms = filters.astype(np.float64)
     return {
-        "patch": geometry.patch,
+        "patch": geometry.sides,
         "stride": geometry.stride,
         "downsample": geometry.downsample,
         "bin_us": geometry.bin_us,

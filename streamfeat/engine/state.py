@@ -71,8 +71,8 @@ def allocate_state(
         touched_slots=np.zeros(geometry.n_bins, np.uint8),
         ring_rows=(np.arange(resolution[0]) // geometry.downsample).astype(np.int32),
         ring_columns=(np.arange(resolution[1]) // geometry.downsample).astype(np.int32),
-        volume_rows=_covering(geometry, ring[1], rows),
-        volume_columns=_covering(geometry, ring[2], columns),
+        volume_rows=_covering(geometry.sides[0], geometry.stride, ring[1], rows),
+        volume_columns=_covering(geometry.sides[1], geometry.stride, ring[2], columns),
         clock=clock,
         cursors=np.zeros((planes, 3), np.int64),
         tally=np.zeros(5, np.int64),
@@ -138,8 +138,8 @@ def _cells(pooling: int, rows: int, columns: int) -> NDArray[np.int32]:
     return np.add.outer(down * pooling, across).astype(np.int32).ravel()
 
 
-def _covering(geometry: Geometry, pixels: int, volumes: int) -> NDArray[np.int32]:
+def _covering(side: int, stride: int, pixels: int, volumes: int) -> NDArray[np.int32]:
     """First and last plus one of the volumes along an axis that cover each of `n` pixels: `(n, 2)`."""
-    starts, pixel = np.arange(volumes) * geometry.stride, np.arange(pixels)
-    first = np.searchsorted(starts, pixel - geometry.patch, side="right")
+    starts, pixel = np.arange(volumes) * stride, np.arange(pixels)
+    first = np.searchsorted(starts, pixel - side, side="right")
     return np.stack([first, np.searchsorted(starts, pixel, side="right")], axis=1).astype(np.int32)

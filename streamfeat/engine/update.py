@@ -44,6 +44,6 @@ def is_worth_sharing(operator: Operator, state: State, crew: Crew) -> bool:
     """Whether there may be enough to do for several threads, by a bound of the volumes to work on."""
     volumes = operator.shape[0] * operator.shape[1]
     if is_complete(operator, state):
-        covering = -((-operator.patch // operator.stride) ** 2)
-        volumes = len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * covering)
+        rows, columns = (-(-side // operator.stride) for side in operator.patch)
+        volumes = len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * rows * columns)
     return crew.is_worth_counting(volumes * operator.offset.shape[0])

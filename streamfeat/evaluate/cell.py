@@ -261,7 +261,7 @@ def _learned(encoder: Encoder) -> dict[str, Any]:
     geometry = encoder.geometry
     shown = np.unique(np.linspace(0, encoder.n_filters - 1, _SHOWN_FILTERS).astype(int))
     return {
-        "shape": [geometry.depth, geometry.patch, geometry.patch],
+        "shape": list(geometry.volume_shape),
         "n_filters": encoder.n_filters,
         "filters": [[round(float(v), 4) for v in encoder.filters[k]] for k in shown],
         **{

@@ -172,7 +172,8 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
             published = [figures[method] for figures in paper.values()]
             _line(plot, list(map(int, paper)), published, label, len(methods) + i, line_dash="dashed")
         yield _with_legend(plot)
-        if timed := [row for row in rows if "update_us" in row]:
+        timed = [row for row in rows if "update_us" in row]
+        if timed and numbers:
             yield _update_costs(name, title, timed)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
 from streamfeat.evaluate.published import PAPER_SWEEPS
-from streamfeat.learn.settings import Setting
+from streamfeat.learn.settings import Setting, parse_patch
 
 __all__ = [
     "METHODS",
@@ -167,7 +167,7 @@ def parse_sweep(text: str) -> tuple[str, list[Any]]:
     name = name.strip().replace("-", "_")
     if name not in SWEPT:
         raise InputError(f"--sweep {text}: {name!r} cannot be swept; choose one of {', '.join(SWEPT)}")
-    parse, such_as = _KINDS[int if name == "volume_bins" else type(_DEFAULTS[name])]
+    parse, such_as = _OTHER_KINDS.get(name) or _KINDS[type(_DEFAULTS[name])]
     try:
         return name, list(dict.fromkeys(parse(part.strip()) for part in values.split(",")))
     except (ValueError, KeyError):
@@ -192,6 +192,12 @@ _KINDS: dict[type, tuple[Any, str]] = {
     type(None): (float, "numbers, such as --sweep {name}=0.25,0.5"),
 }
 """By the type of the default: how a value is read, and what to give; None stands in for a number."""
+
+_OTHER_KINDS: dict[str, tuple[Any, str]] = {
+    "patch": (parse_patch, "patches, such as --sweep {name}=8,8x16,sensor"),
+    "volume_bins": _KINDS[int],
+}
+"""By the name of a setting whose kind its default does not tell."""
 
 
 def paper_sweeps() -> list[tuple[str, list[Any]]]:

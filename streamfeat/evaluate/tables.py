@@ -68,7 +68,9 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def _geometry(setting: dict[str, Any]) -> str:
-    first = f"{setting['patch']}x{setting['patch']}x{setting['bins']}/{setting['stride']}"
+    patch = setting["patch"]
+    area = f"{patch}x{patch}" if isinstance(patch, int) else patch
+    first = f"{area}x{setting['bins']}/{setting['stride']}"
     if setting.get("volume_bins"):
         first = first.replace(f"x{setting['bins']}/", f"x{setting['volume_bins']}/")
     return first if setting["scales"] == "none" else f"{first}+{setting['scales']}"
@@ -84,8 +86,8 @@ def _times(setting: dict[str, Any]) -> str:
 
 
 def _shape(learned: dict[str, Any]) -> str:
-    bins, patch, _ = learned["shape"]
-    return f"{patch}x{patch}x{bins}"
+    bins, rows, columns = learned["shape"]
+    return f"{rows}x{columns}x{bins}"
 
 
 def _interval(row: dict[str, Any]) -> str:

@@ -174,6 +174,7 @@ def change_place(position: int, row: int, column: int, operator: Operator, state
         state: planes, `applied` and scratch are changed.
     """
     n_bins, patch, limit = state.counts.shape[0], operator.patch, operator.max_count
+    height, width = patch
     values = state.values[0, 0]
     slot = slot_of(position, state)
     before = np.int64(state.applied[slot, row, column])
@@ -190,11 +191,11 @@ def change_place(position: int, row: int, column: int, operator: Operator, state
             for c in range(first_column, last_column):
                 volume = r * operator.shape[1] + c
                 top, left = r * operator.stride, c * operator.stride
-                entry = ((position - ahead) * patch + row - top) * patch + column - left
+                entry = ((position - ahead) * height + row - top) * width + column - left
                 if volume > projected or (volume == projected and entry >= last_entry):
                     continue
                 if operator.quadratic.shape[0]:
-                    end = (n_bins - ahead) * patch * patch
+                    end = (n_bins - ahead) * height * width
                     if volume == projected:
                         end = last_entry
                     gather_volume(

@@ -63,7 +63,7 @@ def let_in(
     projection, moments = state.projections[plane, volume], state.moments[plane, volume]
     values, entries, changes = state.windows[part, waiting], state.entries[part], state.changes[part]
     patch, columns, d = operator.patch, operator.shape[1], operator.columns.shape[0]
-    end = (state.applied.shape[0] - ahead) * patch * patch
+    end = (state.applied.shape[0] - ahead) * patch[0] * patch[1]
     top, left = volume // columns * operator.stride, volume % columns * operator.stride
     gather_volume(state.applied, slot_of(ahead, state), np.int64(0), end, top, left, patch, values)
     n = 0

@@ -24,10 +24,11 @@ LANES = 32
 class Operator(NamedTuple):
     """The frozen side of an encoder, in the integers that make streaming exact.
 
-    With `d = n_bins * patch * patch` entries and `Kp` filters after padding (design: `q = P v`).
+    With `d` entries, `bins * rows * columns` of a volume, and `Kp` filters after padding (design: `q = P v`).
     """
 
-    patch: int
+    patch: tuple[int, int]
+    """Rows and columns of a volume."""
     stride: int
     downsample: int
     bin_us: int

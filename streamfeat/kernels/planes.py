@@ -75,7 +75,7 @@ def project_volume(
     projection, moments = state.projections[plane, row], state.moments[plane, row]
     values, entries, changes = state.values[part, 0], state.entries[part], state.changes[part]
     n_bins, patch, columns = state.applied.shape[0], operator.patch, operator.shape[1]
-    end = (n_bins - ahead) * patch * patch
+    end = (n_bins - ahead) * patch[0] * patch[1]
     top, left = volume // columns * operator.stride, volume % columns * operator.stride
     first = np.int64(0) if operator.quadratic.shape[0] else start
     gather_volume(state.applied, slot_of(ahead, state), first, end, top, left, patch, values)
@@ -184,12 +184,12 @@ def list_missing(operator: Operator, state: State) -> None:
     plane, columns, load = state.clock[CLOCK_PLANE], operator.shape[1], np.int64(0)
     n_volumes, n, coded = operator.shape[0] * columns, 0, state.cursors[plane, CURSOR_CODED]
     if coded < n_volumes:
-        count_filled(state.applied, operator.stride, operator.patch, state.lines, state.crowds)
+        count_filled(state.applied, operator.stride, operator.patch[1], state.lines, state.crowds)
         moments, is_shared = state.moments[plane], state.moments.shape[1] < n_volumes
         crowd = state.crowds[state.crowds.shape[0] - 1]
         for r in range(coded // columns, operator.shape[0]):
             crowd[:] = 0
-            for row in range(r * operator.stride, r * operator.stride + operator.patch):
+            for row in range(r * operator.stride, r * operator.stride + operator.patch[0]):
                 counts = state.crowds[row]
                 for c in range(columns):
                     crowd[c] += counts[c]
@@ -315,7 +315,7 @@ def look_ahead(projected: int, coded: int, budget: int, operator: Operator, stat
         end = d
         # What is empty now will be empty then.
         if start > 0 or state.moments[current, volume, MOMENT_SQUARES] or moments[volume, MOMENT_SQUARES]:
-            end -= operator.patch * operator.patch
+            end -= operator.patch[0] * operator.patch[1]
             if start == 0 and budget >= d and can_wait(state):
                 n, waiting = let_in(plane, volume, NEXT, waiting, part, operator, state)
                 start = end

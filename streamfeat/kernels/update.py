@@ -47,7 +47,8 @@ def mark_dirty(operator: Operator, state: State) -> None:
     """
     n_bins, height, width = state.counts.shape
     applied, counts, limit = state.applied.reshape(-1), state.counts.reshape(-1), operator.max_count
-    n_volumes, patch, columns = operator.shape[0] * operator.shape[1], operator.patch, operator.shape[1]
+    n_volumes, columns = operator.shape[0] * operator.shape[1], operator.shape[1]
+    rows, length = operator.patch
     news, is_dirty, stride = state.news.reshape(-1), state.is_dirty, operator.stride
     state.touched_slots[:] = 0
     n_touched = state.clock[CLOCK_TOUCHED]
@@ -74,7 +75,7 @@ def mark_dirty(operator: Operator, state: State) -> None:
             if position < 0 or last + last_entry == 0:
                 continue
             for r in range(first_row, last_row):
-                line_entry = (position * patch + row - r * stride) * patch + column
+                line_entry = (position * rows + row - r * stride) * length + column
                 for c in range(first_column, last_column):
                     volume = r * columns + c
                     inside = volume < last or (volume == last and line_entry - c * stride < last_entry)
@@ -109,6 +110,7 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
         state: rows of these volumes, and sums and scratch of the part, are changed.
     """
     n_bins, patch, columns = state.counts.shape[0], operator.patch, operator.shape[1]
+    area = patch[0] * patch[1]
     values, news, n_volumes = state.values[part, 0], state.values[part, 1], operator.shape[0] * columns
     first_bin, last_bin = touched_bins(state)
     first, last = share_of(part, parts, state)
@@ -120,12 +122,12 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
             prefetch(rows, k)
         plane, volume = np.int64(state.dirty[i]) // n_volumes, np.int64(state.dirty[i]) % n_volumes
         ahead = np.int64(plane != state.clock[CLOCK_PLANE])
-        end = (n_bins - ahead) * patch * patch
+        end = (n_bins - ahead) * area
         if volume == state.cursors[plane, CURSOR_PROJECTED]:
             end = state.cursors[plane, CURSOR_ENTRY]
         top, left = volume // columns * operator.stride, volume % columns * operator.stride
         slot = slot_of(ahead, state)
-        start, stop = max(first_bin - ahead, 0) * patch * patch, min(end, (last_bin - ahead) * patch * patch)
+        start, stop = max(first_bin - ahead, 0) * area, min(end, (last_bin - ahead) * area)
         gather_volume(state.news, slot, start, stop, top, left, patch, news)
         if operator.quadratic.shape[0]:
             gather_volume(state.applied, slot, np.int64(0), end, top, left, patch, values)

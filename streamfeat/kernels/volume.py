@@ -140,7 +140,7 @@ def gather_volume(
     end: int,
     top: int,
     left: int,
-    patch: int,
+    patch: tuple[int, int],
     values: NDArray[np.int16],
 ) -> None:
     """Copy lines of a volume out of a ring, oldest bin first.
@@ -153,25 +153,26 @@ def gather_volume(
         top: first row of the volume.
         left: first column of the volume.
         patch: rows and columns of the volume.
-        values: `(>= T * patch * patch,)`, overwritten in the lines that are copied.
+        values: `(>= d,)`, overwritten in the lines that are copied.
     """
     n_bins, height, width = ring.shape
-    pixels, line, last = ring.reshape(-1), start // patch, (end + patch - 1) // patch
+    rows, columns = patch
+    pixels, line, last = ring.reshape(-1), start // columns, (end + columns - 1) // columns
     while line < last:  # one bin after the other
-        position = line // patch
+        position = line // rows
         slot = first_slot + position
         slot = slot if slot < n_bins else slot - n_bins
-        source = (slot * height + top + line - position * patch) * width + left
-        following = min(last, (position + 1) * patch)
-        for to in range(line * patch, following * patch, patch):
-            if patch < EIGHT:
-                for column in range(patch):
+        source = (slot * height + top + line - position * rows) * width + left
+        following = min(last, (position + 1) * rows)
+        for to in range(line * columns, following * columns, columns):
+            if columns < EIGHT:
+                for column in range(columns):
                     values[to + column] = pixels[source + column]
             else:
                 copy_eight(pixels, source, values, to)
-                for column in range(EIGHT, patch - EIGHT, EIGHT):
+                for column in range(EIGHT, columns - EIGHT, EIGHT):
                     copy_eight(pixels, source + column, values, to + column)
-                copy_eight(pixels, source + patch - EIGHT, values, to + patch - EIGHT)
+                copy_eight(pixels, source + columns - EIGHT, values, to + columns - EIGHT)
             source += width
         line = following
 

@@ -52,7 +52,7 @@ class Model:
             "formulation": encoder.formulation,
             "encoding": encoder.encoding,
             "filters": encoder.n_filters,
-            "patch": geometry.patch,
+            "patch": geometry.patch_name,
             "stride": geometry.stride,
             "bins": geometry.n_bins,
             "volume_bins": geometry.depth,

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
+from streamfeat.events import Resolution
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.dictionary import DictionaryLearner
-from streamfeat.learn.settings import Setting
+from streamfeat.learn.settings import SENSOR, Setting
 from streamfeat.learn.transform import TransformLearner
 from streamfeat.learn.volumes import KEYS, Volumes, sample_volumes, windows_of
 from streamfeat.learn.whitening import VolumeWhitener
@@ -50,12 +51,13 @@ def geometry_of(
     Args:
         setting: where its `window_ms` is None, 19 of 20 labelled samples that are not held out are no longer
             than the window: of a sample that is a little longer, the whole oldest bin would be out of it.
-            100 ms without labels.
+            100 ms without labels. Where its patch is as large as the sensor, recordings are read for
+            the largest.
         recordings: open recordings.
         workers: read labels, where those are needed.
 
     Raises:
-        InputError: a value is out of range.
+        InputError: a value is out of range, or volumes are too few for a patch as large as the sensor.
     """
     if setting.window_ms is not None:
         window_us = round(setting.window_ms * 1000)
@@ -65,7 +67,11 @@ def geometry_of(
         window_us = int(np.quantile(durations or [100_000], _WHOLE, method="higher"))
     given = asdict(setting)
     same = {field.name: given[field.name] for field in fields(Geometry) if field.name in given}
-    return Geometry(n_bins=setting.bins, bin_us=max(1, -(-window_us // setting.bins)), **same)
+    sensors = workers.map(_largest, _openers(recordings)) if setting.patch == SENSOR else []
+    same["patch"] = setting.sides(tuple(np.max([*sensors, (0, 0)], axis=0).tolist()))
+    geometry = Geometry(n_bins=setting.bins, bin_us=max(1, -(-window_us // setting.bins)), **same)
+    setting.check_volumes(geometry.entries)
+    return geometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +153,7 @@ def _sample(
         for part in parts:
             yield *part, int(volumes.keys[-1]) if len(volumes.keys) == n else KEYS
 
-    found = workers.map(_sample_part, pieces(), geometry, n, setting.seed)
+    found = workers.map(_sample_part, pieces(), geometry, n, setting.seed, setting.patch == SENSOR)
     for done, (number, more, lost) in enumerate(found, 1):
         losses[number].add_all(lost)
         waiting.append(more)
@@ -158,7 +164,7 @@ def _sample(
         recording.losses = lost
     if len(volumes.keys) == 0:
         raise InputError(
-            f"no local volume of {geometry.patch}x{geometry.patch} pixels with an event was found in "
+            f"no local volume of {geometry.sides[0]}x{geometry.sides[1]} pixels with an event was found in "
             f"{volumes.windows} windows; check the recording's resolution and splits"
         )
     return volumes
@@ -176,13 +182,27 @@ def _labels(opener: Callable[[], Recording], number: int) -> list[Label]:
         return [*recording.stored_labels()]
 
 
+def _largest(opener: Callable[[], Recording], number: int) -> Resolution:
+    """The most rows and the most columns of a sensor in a part of a recording."""
+    with opener() as recording:
+        found = [item.resolution for item in recording.items() if not isinstance(item, Label)]
+    height, width = np.max([*found, (1, 1)], axis=0).tolist()
+    return height, width
+
+
 def _sample_part(
-    opener: Callable[[], Recording], number: int, limit: int, geometry: Geometry, n: int, seed: int
+    opener: Callable[[], Recording],
+    number: int,
+    limit: int,
+    geometry: Geometry,
+    n: int,
+    seed: int,
+    padded: bool,
 ) -> tuple[int, Volumes, Losses]:
     """The number of the recording, the volumes of one part of it, and its losses."""
     with opener() as recording:
         windows = windows_of(recording.items(), geometry)
-        volumes = sample_volumes(windows, geometry, n, (seed, number), limit=limit)
+        volumes = sample_volumes(windows, geometry, n, (seed, number), limit=limit, padded=padded)
         return number, volumes, recording.losses
 
 
@@ -197,7 +217,7 @@ def geometries_of(
         *(
             replace(
                 geometry,
-                patch=other.patch,
+                patch=other.sides((0, 0)),
                 stride=other.stride,
                 downsample=other.downsample,
                 n_bins=other.bins,

@@ -4,6 +4,7 @@ Lives here: the rate of a recording's first second, what a reading costs, the fi
 Not here: the geometry itself (`engine.geometry`), whether a stream keeps pace (`stream.load`).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -57,11 +58,10 @@ def load_of(setting: Setting, resolution: tuple[int, int], rate: float) -> float
         resolution: `(height, width)` of the sensor.
         rate: events a second.
     """
-    geometry = Geometry(patch=setting.patch, stride=setting.stride, downsample=setting.downsample)
-    if min(geometry.ring_shape(resolution)) < geometry.patch:
-        return 0.0
+    sides = setting.sides(resolution)
+    geometry = Geometry(patch=sides, stride=setting.stride, downsample=setting.downsample)
     rows, columns = geometry.grid_shape(resolution)
-    covering = max(1.0, setting.patch / setting.stride) ** 2
+    covering = math.prod(max(1.0, side / setting.stride) for side in sides)
     changed = min(rows * columns, rate * _EVERY_S * covering)
     return min(setting.filters, _FILTERS) * changed * _SECONDS_A_FILTER / _EVERY_S
 

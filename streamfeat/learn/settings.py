@@ -14,7 +14,7 @@ from streamfeat.errors import InputError
 if TYPE_CHECKING:
     from streamfeat.engine.encoder import Encoding, Formulation
 
-__all__ = ["DEFAULTS", "PRESETS", "THRESHOLD", "Setting", "preset_with"]
+__all__ = ["DEFAULTS", "PRESETS", "SENSOR", "THRESHOLD", "Setting", "parse_patch", "preset_with"]
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -44,6 +44,28 @@ THRESHOLD = 1.0
 """Default threshold of encoding."""
 
 
+SENSOR = "sensor"
+"""Instead of a patch: one as large as the sensor."""
+
+
+def parse_patch(value: Any) -> int | str:
+    """A patch as it is given, in its one spelling: 12, `8x16` or `sensor`.
+
+    Raises:
+        InputError: it is none of these.
+    """
+    text = "x".join(map(str, value)) if isinstance(value, list | tuple) else str(value).strip().lower()
+    found = re.fullmatch(r"([1-9]\d{0,3})(?:x([1-9]\d{0,3}))?", text)
+    if text == SENSOR:
+        return SENSOR
+    if not found:
+        raise InputError(
+            f"patch {str(value)!r} is not understood; give pixels such as 12, ROWSxCOLUMNS such as 8x16, or "
+            "sensor"
+        )
+    return int(found[1]) if found[2] in (None, found[1]) else text
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
     """The settings of `streamfeat learn`: geometry and learning, with their defaults.
@@ -54,7 +76,8 @@ class Setting:
         formulation: which of the paper's problems is solved, `direct` or `inverse`.
         encoding: what is pooled, `soft`, `split` or `triangle`.
         filters: number of filters or atoms, `K`.
-        patch: rows and columns of a local volume, in ring pixels.
+        patch: ring pixels along each side of a local volume; `8x16`, or two numbers, for rows and columns;
+            `sensor` for all of the largest sensor in the recordings (a fully connected layer).
         stride: ring pixels between neighbouring volumes.
         bins: time bins in the window.
         window_ms: length of the window; None for one that holds 95 % of the labelled
@@ -86,7 +109,7 @@ class Setting:
     formulation: "Formulation" = "direct"
     encoding: "Encoding" = "split"
     filters: int = 400
-    patch: int = 12
+    patch: int | str = 12
     stride: int = 2
     bins: int = 3
     window_ms: float | None = None
@@ -142,16 +165,38 @@ class Setting:
         if self.volumes < 2 or self.iterations < 1 or self.filters < 1:
             raise InputError("at least two volumes, one iteration and one filter are needed to learn")
         times = Geometry(n_bins=self.bins, volume_bins=self.volume_bins, time_stride=self.time_stride)
-        entries = times.depth * self.patch * self.patch
-        if self.volumes < max(self.filters, entries + 1):
-            raise InputError(
-                f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
-                f"{entries} entries; learn from at least {max(self.filters, entries + 1)}"
-            )
+        object.__setattr__(self, "patch", parse_patch(self.patch))
+        rows, columns = (1, 1) if self.patch == SENSOR else self.sides((0, 0))
+        self.check_volumes(times.depth * rows * columns)
         if not 0 <= self.seed < 2**32:
             raise InputError(f"seed is {self.seed}, it must be from 0 to 2^32 - 1")
         if self.scales != "none":
             self.each  # noqa: B018  (refuses what makes no sense)
+
+    def sides(self, resolution: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of a local volume, in ring pixels.
+
+        Args:
+            resolution: `(height, width)` of the largest sensor; it matters for `sensor` only.
+        """
+        if self.patch == SENSOR:
+            height, width = (-(-side // self.downsample) for side in resolution)
+            return height, width
+        rows, _, columns = str(self.patch).partition("x")
+        return int(rows), int(columns or rows)
+
+    def check_volumes(self, entries: int) -> None:
+        """Refuse to learn from too few volumes of so many entries.
+
+        Raises:
+            InputError: with the number that is enough.
+        """
+        if self.volumes < max(self.filters, entries + 1):
+            raise InputError(
+                f"{self.volumes} volumes are too few for {self.filters} filters and a covariance of "
+                f"{entries} entries; learn from at least {max(self.filters, entries + 1)}"
+                + (", or with a higher downsample" if self.patch == SENSOR else "")
+            )
 
     @property
     def each(self) -> "tuple[Setting, ...]":

@@ -137,6 +137,7 @@ def sample_volumes(
     *,
     limit: int = KEYS,
     per_window: int = _PER_WINDOW,
+    padded: bool = False,
 ) -> Volumes:
     """Draw local volumes at random places, each not empty, with equal chance for every window.
 
@@ -145,18 +146,20 @@ def sample_volumes(
     begins and on how many events it has, and on nothing that was read before.
 
     Args:
-        windows: any number of windows; those with no place for a volume are passed over.
+        windows: any number of windows.
         geometry: of the volumes.
         n_volumes: keep no more than those of the smallest keys; memory is for four times as many.
         seed: not negative; the seed, and what tells recordings apart.
         limit: keep only keys below.
         per_window: places to keep from each window.
+        padded: whether a sensor that is smaller than a volume has one, with pixels that never fire; its
+            windows are passed over otherwise.
     """
     kept = Volumes.none(geometry)
     waiting: list[Volumes] = []
     n_waiting = 0
     for window in windows:
-        if not geometry.has_room(window.resolution):
+        if not (padded or geometry.has_room(window.resolution)):
             continue
         one = _draw_from(window, geometry, seed, limit, per_window)
         waiting.append(one)
@@ -174,7 +177,7 @@ def _draw_from(
     origin = window.origin_us % (1 << 64)  # a generator's seed is not negative
     rng = np.random.default_rng([*seed, origin, len(window.events)])
     counts = count_window(geometry, window.events, window.resolution, window.origin_us, window.last_us)
-    places = sliding_window_view(counts, (geometry.depth, geometry.patch, geometry.patch))
+    places = sliding_window_view(counts, geometry.volume_shape)
     keys = rng.integers(0, KEYS, per_window)
     tries = (_TRIES, per_window)
     rows, columns = rng.integers(0, places.shape[1], tries), rng.integers(0, places.shape[2], tries)

@@ -271,7 +271,7 @@ class ListenJob:
 
 def _screen(health: Health, console: Console) -> Live:
     return Live(
-        get_renderable=lambda: HealthTable(health),
+        HealthTable(health),
         console=console,
         refresh_per_second=_DRAWN_A_SECOND,
         transient=True,

@@ -58,7 +58,7 @@ def _described(shown: Any) -> tuple[str, dict[str, Any]]:
 def _encoder(encoder: Any) -> dict[str, Any]:
     g = encoder.geometry
     filters = f"{encoder.n_filters:,} {'filters' if encoder.formulation == 'direct' else 'atoms'}"
-    volume = f"{g.depth}x{g.patch}x{g.patch}"
+    volume = "x".join(map(str, g.volume_shape))
     rows = {
         "formulation": encoder.formulation,
         "encoding": f"{encoder.encoding}, threshold {encoder.threshold:g}",
@@ -69,9 +69,9 @@ def _encoder(encoder: Any) -> dict[str, Any]:
         "state": "narrow, sums of 16 bits" if encoder.is_narrow else "wide, sums of 32 bits",
         "learned from": ", ".join(map(str, encoder.provenance.get("recordings", []))) or "unknown",
     }
-    shown = encoder.filters[:_MOST_FILTERS].reshape(-1, g.depth, g.patch, g.patch)
+    shown = encoder.filters[:_MOST_FILTERS].reshape(-1, *g.volume_shape)
     # Bins beside each other, the oldest on the left.
-    images = shown.transpose(0, 2, 1, 3).reshape(len(shown), g.patch, g.depth * g.patch)
+    images = shown.transpose(0, 2, 1, 3).reshape(len(shown), g.sides[0], -1)
     line = [encoder.formulation, encoder.encoding, *["narrow"] * encoder.is_narrow]
     line += [f"{filters} of {volume}", f"{g.window_us / 1000:g} ms"]
     return {

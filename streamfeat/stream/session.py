@@ -373,8 +373,7 @@ class Session(Emitter):
         if sample is None:
             return
         self._stats.samples += 1
-        geometry = self.encoder.geometry
-        engine = self._engine or self._engine_for((geometry.patch * geometry.downsample,) * 2)
+        engine = self._engine or self._engine_for(self.encoder.geometry.smallest)
         batch = self._emit(engine, sample.start_us + sample.duration_us, final=True)
         emission = batch[0]
         if emission.correct and self._stats.correct is not None:

@@ -36,11 +36,10 @@ def warm_up(
         for encoding in PAYLOAD_ENCODINGS:
             payload, base_ns = encode(event, encoding)
             make_decoder(encoding).decode(payload, base_ns)
-    side = encoder.geometry.patch * encoder.geometry.downsample
     # In time and late are the two ways to feed, however long compiling takes.
     for is_late in (False, True):
         session = Session(encoder, policy, classifier, is_behind=lambda log_time_ns, is_late=is_late: is_late)  # type: ignore[misc]
-        for _ in session.batches(Packet("", event, (side, side), 0, 0)):
+        for _ in session.batches(Packet("", event, encoder.geometry.smallest, 0, 0)):
             pass
         session.rest()
         for _ in session.last_batches():

@@ -77,8 +77,8 @@ def draw(what: Events | Encoder, resolution: Resolution | None = None) -> Drawin
     """
     if isinstance(what, Encoder):
         g = what.geometry
-        filters = what.filters[:_MOST_FILTERS].reshape(-1, g.depth, g.patch, g.patch)
-        grey = mosaic(filters.transpose(0, 2, 1, 3).reshape(len(filters), g.patch, g.depth * g.patch))
+        filters = what.filters[:_MOST_FILTERS].reshape(-1, *g.volume_shape)
+        grey = mosaic(filters.transpose(0, 2, 1, 3).reshape(len(filters), g.sides[0], -1))
         return Drawing(np.dstack([grey, grey, grey, np.full_like(grey, 255)]))
     events = as_events(what)
     if resolution is None:

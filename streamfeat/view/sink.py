@@ -198,7 +198,7 @@ def about(encoder: Encoder | None, labels: Sequence[str]) -> dict[str, str]:
         "formulation": encoder.formulation,
         "encoding": encoder.encoding,
         "filters": str(encoder.n_filters),
-        "patch": str(geometry.patch),
+        "patch": str(geometry.patch_name),
         "stride": str(geometry.stride),
         "bins": str(geometry.n_bins),
         "volume_bins": str(geometry.depth),

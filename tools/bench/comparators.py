@@ -7,9 +7,9 @@ Not here: the methods (`streamfeat.evaluate`), and how updates are timed (`strea
     streamfeat evaluate ncars.mcap --method direct --method hats --method dart -o result.json
     python -m tools.bench.comparators ncars.mcap result.json --json table.json
 
-Filters of `direct`, `inverse`, `kmeans` and `random` are learned again in the setting of the result, from
-as few volumes as it allows and in two iterations: which filters they are hardly changes what an update costs.
-EST has no update: its network reads a whole sample, and what that took in the result is the column beside.
+Filters of `direct`, `inverse`, `kmeans` and `random` are learned again in the setting of the result, in two
+iterations: which filters they are hardly changes what an update costs. EST has no update: its network reads a
+whole sample, and what that took in the result is the column beside.
 """
 
 import argparse
@@ -109,8 +109,7 @@ def _walker(recording: Path, row: dict[str, Any], items: Sequence[Any]) -> Walke
     setting = Trial(**{name: value for name, value in row["setting"].items() if name in known})
     if method == "inverse":
         setting = replace(setting, formulation="inverse")
-    fewest = max(setting.filters, setting.bins * setting.patch**2 + 1)
-    setting = replace(setting, volumes=min(setting.volumes, fewest), iterations=min(setting.iterations, 2))
+    setting = replace(setting, iterations=min(setting.iterations, 2))
     with sf.open_recording(recording) as opened:
         encoder = make_features(method, [opened], setting, lambda *step: None)
     assert isinstance(encoder, sf.Encoder)
