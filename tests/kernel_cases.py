@@ -1123,6 +1123,13 @@ TIME_SURFACES = {
     "a pixel that was never seen": lambda call: call.out.size > 0 and call.latest.shape[1] > len(call.t),
     "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
 }
+DESCRIBE_EVENTS = {
+    "no event": lambda call: len(call.x) == 0,
+    "an event is forgotten": lambda call: len(call.x) > 0 and call.queue.min() >= 0,
+    "nothing is forgotten": lambda call: len(call.x) > 0 and call.queue.min() < 0,
+    "nothing lies around an event": lambda call: len(call.x) > 0 and call.out.sum(axis=1).min() == 0,
+    "a place of the grid for no offset": lambda call: call.places.max() + 1 < call.out.shape[1],
+}
 
 ROWS = {
     "no row": lambda call: call.result == 0,
@@ -1329,6 +1336,7 @@ CASES = {
     "follow_event": FOLLOW_EVENT,
     "gather_volume": GATHER_VOLUME,
     "fire_pixels": FIRE_PIXELS,
+    "describe_events": DESCRIBE_EVENTS,
     "spike_first": SPIKING | FIRST,
     "spike_leaky": SPIKING | LEAKY,
     "add_memory_surfaces": MEMORY_SURFACES,

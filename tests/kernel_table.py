@@ -33,6 +33,7 @@ from streamfeat.kernels import (
     pixels,
     planes,
     predict,
+    retina,
     spiking,
     surfaces,
     trace,
@@ -1577,6 +1578,20 @@ def make_time_surfaces(rng):
     return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
 
 
+def make_describe_events(rng):
+    height, width, radius, n_places = (int(rng.integers(1, most)) for most in (9, 9, 4, 6))
+    x, y, _, _ = _surface_events(rng, height, width, random_length(rng, 60))
+    places = rng.integers(-1, n_places, (2 * radius + 1, 2 * radius + 1))
+    recent = np.zeros((height + 2 * radius, width + 2 * radius), np.int64)
+    queue, filled = np.full(int(rng.integers(1, 30)), -1), rng.random() < 0.5
+    if filled:
+        rows, columns = rng.integers(0, height, len(queue)), rng.integers(0, width, len(queue))
+        queue[:] = (rows + radius) * recent.shape[1] + columns + radius
+        np.add.at(recent.reshape(-1), queue, 1)
+    head = rng.integers(0, len(queue) if filled else 1, 1)
+    return x, y, places, recent, queue, head, np.empty((len(x), n_places), np.float32)
+
+
 def _neurons(rng):
     """Events, and the shapes of neurons and of cells of a few pixels."""
     height, width, cell, n_orientations = (int(rng.integers(1, most)) for most in (9, 9, 5, 5))
@@ -1746,6 +1761,7 @@ KERNELS = [
     Row(trace.trace, make_trace, exact_trace),
     Row(pixels.draw_picture, make_draw_picture),
     Row(pixels.fire_pixels, make_fire_pixels),
+    Row(retina.describe_events, make_describe_events),
     Row(spiking.spike_first, make_spike_first),
     Row(spiking.spike_leaky, make_spike_leaky, close_surfaces),
     Row(surfaces.add_memory_surfaces, make_add_memory_surfaces, close_surfaces),

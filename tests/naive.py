@@ -1298,6 +1298,23 @@ def fire_pixels(
     return stop, n
 
 
+# streamfeat.kernels.retina
+
+
+def describe_events(x, y, places, recent, queue, head, out):
+    radius, width = places.shape[0] // 2, recent.shape[1]
+    for i, (xi, yi) in enumerate(zip(x.tolist(), y.tolist(), strict=True)):
+        if queue[head[0]] >= 0:
+            recent.flat[queue[head[0]]] -= 1
+        queue[head[0]] = (yi + radius) * width + xi + radius
+        recent.flat[queue[head[0]]] += 1
+        head[0] = (head[0] + 1) % len(queue)
+        around = recent[yi : yi + 2 * radius + 1, xi : xi + 2 * radius + 1]
+        on_grid = places >= 0
+        counts = np.bincount(places[on_grid], around[on_grid], minlength=out.shape[1]).astype(np.float32)
+        out[i] = counts / np.float32(max(counts.sum(), 1))
+
+
 # streamfeat.kernels.spiking
 
 

@@ -92,6 +92,7 @@ ONLY_IN = {
     "websockets": {"view"},
     "PIL": {"simulate"},
     "av": {"simulate"},
+    "torch": {"evaluate"},
     "numba": {"kernels", "latency", "cli"},
     "llvmlite": {"kernels", "cli"},
 }

@@ -20,13 +20,14 @@ from streamfeat import cli
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
+from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import make_events
 from streamfeat.latency.end_to_end import measure_end_to_end, without_silence
 from streamfeat.latency.histogram import PERCENTILES, Latencies, RecentLatencies
 from streamfeat.latency.measure import LatencyReport
-from streamfeat.latency.others import TIMED, Method, any_prototypes, walk_method
+from streamfeat.latency.others import TIMED, Method, any_prototypes, any_words, walk_method
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.text import spell
 from streamfeat.latency.update import call_each, feed_and_read, walk
@@ -428,6 +429,7 @@ def test_one_split_without_look_ahead(run, home):
 OTHERS = {
     "hats": lambda columns, events, resolution: AveragedSurfaces(resolution).encode(events, resolution),
     "hots": lambda columns, events, resolution: SurfaceHistogram(any_prototypes()).encode(events, resolution),
+    "dart": lambda columns, events, resolution: RetinalWords(any_words()).encode(events, resolution),
     "hfirst": lambda columns, events, resolution: FirstSpikes().counter(resolution)(*columns).ravel(),
     "gabor-snn": lambda columns, events, resolution: LeakySpikes().counter(resolution)(*columns).ravel(),
     "counts": lambda columns, events, resolution: CountImage().encode(events, resolution),
@@ -455,7 +457,7 @@ def test_a_method_is_walked_sample_by_sample_and_warms_up():
     assert len(took) == n_events(items) - 100
     assert asked[-1] == n_events(items)
     with pytest.raises(InputError, match="choose from hats, hots"):
-        Method("dart")
+        Method("sift")
 
 
 def test_updates_of_others_stand_beside_ours(run, home):

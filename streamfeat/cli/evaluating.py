@@ -58,7 +58,8 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--method",
-            help="direct, inverse, kmeans, random, model, hats, hots, hfirst, gabor-snn, counts; repeat it.",
+            help="direct, inverse, kmeans, random, model, hats, hots, dart, est, hfirst, gabor-snn, counts; "
+            "repeat it.",
             show_default="direct and inverse; model with -m",
         ),
     ] = None,
@@ -78,6 +79,14 @@ def evaluate(
             help="Vary one option, such as filters=1000,1500 or encoding=soft,split; may be repeated.",
         ),
     ] = None,
+    paper: Annotated[
+        bool,
+        typer.Option(
+            "--paper",
+            help="The paper's third table: its preset, both formulations, sweeps of filters, patch and bins, "
+            "beside its figures, with what an update costs.",
+        ),
+    ] = False,
     preset: options.Preset = "default",
     encoding: options.Encoding = None,
     filters: options.Filters = None,
@@ -149,8 +158,16 @@ def evaluate(
     block of neighbours: samples that were cut from one video are near copies. With -o every finished run is
     kept beside the result: the same command goes on after an interruption.
     """
+    from streamfeat.evaluate.methods import needs
     from streamfeat.evaluate.page import check_page, write_page
-    from streamfeat.evaluate.plan import TRAINING_PRESETS, WITHOUT_KERNELS, Trial, parse_sweep, plan_cells
+    from streamfeat.evaluate.plan import (
+        TRAINING_PRESETS,
+        WITHOUT_KERNELS,
+        Trial,
+        paper_sweeps,
+        parse_sweep,
+        plan_cells,
+    )
     from streamfeat.evaluate.run import evaluate as run
     from streamfeat.evaluate.run import read_result, save_result, state_path
     from streamfeat.evaluate.splits import DataSet
@@ -163,6 +180,8 @@ def evaluate(
     if page:
         check_page(page)
     earlier = read_result(against) if against else None
+    if paper and _by_default(context, "preset"):
+        context.params["preset"] = preset = "paper"
     base = options.setting_given(context) | {
         "mirror": mirror,
         "cuts": cuts,
@@ -173,13 +192,13 @@ def evaluate(
         "model": str(model or ""),
     }
     for name, value in TRAINING_PRESETS.get(preset, {}).items():
-        source = context.get_parameter_source(name)
-        if source and source.name == "DEFAULT":
+        if _by_default(context, name):
             base[name] = value
     methods = methods or (["model"] if model else ["direct", "inverse"])
     if model and "model" not in methods:
         raise InputError(f"-m {model} is for --method model; add that, or leave out -m")
-    parsed = [parse_sweep(text) for text in sweeps or []]
+    needs(methods)
+    parsed = (paper_sweeps() if paper else []) + [parse_sweep(text) for text in sweeps or []]
     plan_cells(methods, base, parsed, 1)  # refuses what cannot be before labels are read
     how = (
         f"the same command goes on from {state_path(output)}: {_this_command()}"
@@ -206,6 +225,7 @@ def evaluate(
                 report=report,
                 workers=place,
                 against=earlier,
+                costs=paper,
                 finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:
@@ -219,6 +239,12 @@ def evaluate(
         print_json("evaluate", result)
     else:
         _print(result)
+
+
+def _by_default(context: typer.Context, name: str) -> bool:
+    """Whether an option was not given."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "DEFAULT"
 
 
 def _this_command() -> str:

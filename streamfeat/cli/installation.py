@@ -33,6 +33,7 @@ EXTRAS = {
     "export": "Arrow, Parquet and pandas",
     "plot": "pages and pictures of results",
     "simulate": "events of images and videos",
+    "deep": "the network of `evaluate --method est`",
     "store": "recordings by URL",
     "view": "Foxglove",
     "bench": "peers in tools/bench",

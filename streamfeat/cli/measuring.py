@@ -82,8 +82,8 @@ def latency(
         list[str] | None,
         typer.Option(
             "--method",
-            help="Updates of others beside: hats, hots, hfirst, gabor-snn or counts; may be repeated.",
-            autocompletion=completing("hats", "hots", "hfirst", "gabor-snn", "counts"),
+            help="Updates of others beside: hats, hots, dart, hfirst, gabor-snn or counts; may be repeated.",
+            autocompletion=completing("hats", "hots", "dart", "hfirst", "gabor-snn", "counts"),
         ),
     ] = None,
     plot: Annotated[

@@ -21,6 +21,7 @@ from streamfeat.classify.training import train
 from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.codes import code_statistics
+from streamfeat.evaluate.costs import update_us
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
@@ -49,6 +50,7 @@ def run_cells(
     *,
     early_samples: int,
     workers: Workers = THIS_PROCESS,
+    costs: bool = False,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells that the same features serve; results are JSON values.
 
@@ -60,6 +62,7 @@ def run_cells(
         report: told about progress.
         early_samples: held-out samples for early decision; none if 0.
         workers: learn and encode; see `make_features`.
+        costs: time an update of one event, where the method has an encoder.
 
     Yields:
         each cell and its result as soon as it is done.
@@ -75,9 +78,12 @@ def run_cells(
             features = _features(cell, data, recordings, report, workers)
             learned = time.perf_counter()
             _compile(features, recordings)
-            compiled = time.perf_counter()
+            cost = (
+                update_us(features, _samples(recordings)) if costs and isinstance(features, Encoder) else None
+            )
+            encoding = time.perf_counter()
             samples = encode_recordings(features, recordings, report, workers=workers)
-            seconds = {PLAIN: time.perf_counter() - compiled}
+            seconds = {PLAIN: time.perf_counter() - encoding}
             others: dict[Variant, EncodedSamples] = {}
             images: EncodedSamples | None = None
             if any(cell.setting.test_mirror for cell in cells):
@@ -105,6 +111,8 @@ def run_cells(
                         cell, features, classifier, split[0], recordings, report, early_samples
                     )
             del result["classifier"]
+            if cost is not None:
+                result["update_us"] = round(cost, 3)
             result["learn_s"] = round(learned - started, 3)
             encoded = {PLAIN, *variants} | ({_MIRRORED} if cell.setting.test_mirror else set())
             result["encode_s"] = round(sum(seconds[v] for v in encoded), 3)

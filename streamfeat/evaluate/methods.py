@@ -1,7 +1,8 @@
 """From a method's name and a setting to a map from events to features.
 
 Lives here: learning with either formulation, and the filters that those are compared with.
-Not here: methods that learn no filters (`surfaces`, `spiking`), and what features are good for (`cell`).
+Not here: methods of others (`surfaces`, `spiking`, `retina`, `spike_tensor`), what features are worth
+(`cell`).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,16 +13,18 @@ import numpy as np
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.engine.geometry import Geometry
 from streamfeat.evaluate.plan import Trial
+from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.learn.fit import geometries_of, learn_encoder, prepare
 from streamfeat.learn.initial import random_filters, spherical_means
 from streamfeat.learn.settings import Setting
 from streamfeat.recordings.reader import Recording
+from streamfeat.report.pages import require
 from streamfeat.shipped.general import GENERAL_MODEL
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
-__all__ = ["make_features", "model_path"]
+__all__ = ["make_features", "model_path", "needs"]
 
 _MEANS_ITERATIONS = 20
 """As many passes over the volumes as the direct formulation takes with its start."""
@@ -60,19 +63,40 @@ def make_features(
     if method == "counts":
         return CountImage()
     if method == "hfirst":
-        return FirstSpikes()
+        return FirstSpikes(downsample=setting.downsample)
     if method == "gabor-snn":
-        return LeakySpikes()
+        return LeakySpikes(downsample=setting.downsample)
     if method == "hats":
-        return AveragedSurfaces.fitted(recordings)
+        return AveragedSurfaces.fitted(recordings, setting.downsample)
     if method == "hots":
-        return SurfaceHistogram.fitted(recordings, seed=setting.seed)
+        return SurfaceHistogram.fitted(recordings, seed=setting.seed, downsample=setting.downsample)
+    if method == "dart":
+        return RetinalWords.fitted(recordings, seed=setting.seed, downsample=setting.downsample)
+    if method == "est":
+        return _spike_tensor(recordings, setting, report)
     if method in ("kmeans", "random"):
         return _other_filters(method, recordings, setting, report, workers)
     encoder = learn_encoder(recordings, setting, report=report, workers=workers)
     if encoder.provenance["interrupted"]:  # an encoder of fewer iterations is not what was asked for
         raise KeyboardInterrupt
     return encoder
+
+
+def needs(methods: Sequence[str]) -> None:
+    """Check that the libraries of methods are there, before work is done that would be lost.
+
+    Raises:
+        InputError: PyTorch is not installed, and a method is of it.
+    """
+    if "est" in methods:
+        require("torch", extra="deep", what="--method est")
+
+
+def _spike_tensor(recordings: Sequence[Recording], setting: Trial, report: Report) -> FeatureMap:
+    needs(["est"])
+    from streamfeat.evaluate.spike_tensor import SpikeTensor  # takes seconds, and PyTorch may not be there
+
+    return SpikeTensor.fitted(recordings, downsample=setting.downsample, seed=setting.seed, report=report)
 
 
 def _other_filters(

@@ -22,6 +22,7 @@ from streamfeat.evaluate.tables import (
     in_order,
     notes,
     online_table,
+    published_table,
     sweep_tables,
     value_text,
 )
@@ -41,6 +42,11 @@ _MOST_COUNTS = 30
 _PAIRS_SHOWN = 10
 _SHORT_NAME = 2
 """Letters of a name that has room beside others."""
+
+_PUBLISHED = (
+    "Beside what was published, of recorded data, each on its own split and with its own classifier: figures "
+    "in one row are not of the same samples unless these recordings are that data set."
+)
 
 Parts = list[Any]
 
@@ -75,6 +81,9 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
     warnings = [note for note in notes(result) if note.startswith("WARNING")]
     said = [note for note in notes(result) if note not in warnings]
     accuracy += [*warnings, _accuracies(rows), table]
+    header, beside = published_table(result)
+    if beside:
+        accuracy += [_PUBLISHED, Table(header, beside, [False] + [True] * (len(header) - 1))]
     header, folds = fold_table(result)
     if folds:
         folded = Table(header, folds, [False] + [True] * (len(header) - 1))
@@ -163,6 +172,18 @@ def _sweeps(result: dict[str, Any]) -> Iterator["str | Table | figure"]:
             published = [figures[method] for figures in paper.values()]
             _line(plot, list(map(int, paper)), published, label, len(methods) + i, line_dash="dashed")
         yield _with_legend(plot)
+        timed = [row for row in rows if "update_us" in row]
+        if timed and numbers:
+            yield _update_costs(name, title, timed)
+
+
+def _update_costs(name: str, title: str, rows: Sequence[dict[str, Any]]) -> "figure":
+    """What an update costs over the values of a sweep."""
+    plot = _plot(title, "update of one event, us", height=_SMALL + 80, y_axis_type="log")
+    for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+        mine = sorted((row["setting"][name], row["update_us"]) for row in rows if row["method"] == method)
+        _line(plot, [value for value, _ in mine], [cost for _, cost in mine], method, i)
+    return _with_legend(plot)
 
 
 def _early(result: dict[str, Any], rows: Sequence[dict[str, Any]]) -> Parts:

@@ -11,6 +11,7 @@ from typing import Any
 from streamfeat.classify.training import check_kernel
 from streamfeat.classify.variants import Variant, parse_cuts, variants_of
 from streamfeat.errors import InputError
+from streamfeat.evaluate.published import PAPER_SWEEPS
 from streamfeat.learn.settings import Setting, parse_patch
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "WITHOUT_KERNELS",
     "Cell",
     "Trial",
+    "paper_sweeps",
     "parse_sweep",
     "plan_cells",
     "used_by",
@@ -32,13 +34,15 @@ METHODS = {
     "model": "a model that was learned before, the general one that ships without -m",
     "hats": "HATS, averaged time surfaces",
     "hots": "HOTS, one layer of time surfaces",
+    "dart": "DART, words of log-polar descriptors",
+    "est": "EST, a learned kernel on spikes and a small network trained from nothing, with labels",
     "hfirst": "HFirst, first spikes of oriented neurons",
     "gabor-snn": "Gabor-SNN, spikes of leaky oriented neurons",
     "counts": "count images",
 }
 """Every method, and what it is."""
 
-WITHOUT_KERNELS = frozenset({"hats", "hots", "counts"})
+WITHOUT_KERNELS = frozenset({"hats", "hots", "dart", "est", "counts"})
 """Methods that have no encoder, and so nothing to compile first."""
 
 _LEARNING = {"lambda0", "start", "rows", "iterations", "conditioning", "coherence", "log_det"}
@@ -46,10 +50,12 @@ _NOT_USED = {"inverse": {"rows", "conditioning", "log_det"}, "kmeans": _LEARNING
 _TRAINING = ("mirror", "cuts", "shift", "kernel", "test_mirror")
 _OTHERS_USE = {
     "model": ("model", *_TRAINING),
-    "hats": _TRAINING,
-    "hots": ("seed", *_TRAINING),
-    "hfirst": _TRAINING,
-    "gabor-snn": _TRAINING,
+    "hats": ("downsample", *_TRAINING),
+    "hots": ("downsample", "seed", *_TRAINING),
+    "dart": ("downsample", "seed", *_TRAINING),
+    "est": ("downsample", "seed", *_TRAINING),
+    "hfirst": ("downsample", *_TRAINING),
+    "gabor-snn": ("downsample", *_TRAINING),
     "counts": _TRAINING,
 }
 """Settings of methods that learn no filters here."""
@@ -192,6 +198,11 @@ _OTHER_KINDS: dict[str, tuple[Any, str]] = {
     "volume_bins": _KINDS[int],
 }
 """By the name of a setting whose kind its default does not tell."""
+
+
+def paper_sweeps() -> list[tuple[str, list[Any]]]:
+    """The sweeps of the paper's third table, as from `parse_sweep`: filters, patch and bins."""
+    return [(name, [*figures]) for name, figures in PAPER_SWEEPS.items()]
 
 
 def plan_cells(

@@ -21,7 +21,7 @@ from streamfeat.evaluate.cell import run_cells
 from streamfeat.evaluate.leakage import check_leakage
 from streamfeat.evaluate.methods import Report, model_path
 from streamfeat.evaluate.plan import Cell
-from streamfeat.evaluate.published import PAPER, PAPER_SWEEPS, SWEEP_DATA
+from streamfeat.evaluate.published import ACCURACIES, PAPER, PAPER_SWEEPS, SWEEP_DATA
 from streamfeat.evaluate.scores import (
     SHARE,
     accuracy_interval,
@@ -157,6 +157,7 @@ def evaluate(
     finished: Callable[[dict[str, Any]], None] = lambda row: None,
     workers: Workers = THIS_PROCESS,
     against: Mapping[str, Any] | None = None,
+    costs: bool = False,
 ) -> dict[str, Any]:
     """Run all cells that are not done, and add up the result (JSON values).
 
@@ -169,6 +170,7 @@ def evaluate(
         finished: called with each row of the result when its last fold is done.
         workers: learn and encode.
         against: an earlier result, from `read_result`; each row has its difference to the first row there.
+        costs: time updates, see `run_cells`.
 
     Raises:
         InputError: see `run_cells` and `StateFile`; or the earlier result is of other samples.
@@ -195,7 +197,12 @@ def evaluate(
                     if other.has_features_of(cell) and kept.get(other) is None:
                         alike.setdefault(_name(other.key), other)
                 for one, result in run_cells(
-                    data, [*alike.values()], report, early_samples=early_samples, workers=workers
+                    data,
+                    [*alike.values()],
+                    report,
+                    early_samples=early_samples,
+                    workers=workers,
+                    costs=costs,
                 ):
                     kept.add(one, result)
             if cell.fold == data.n_folds - 1:
@@ -215,7 +222,12 @@ def evaluate(
         "interval": f"95 % bootstrap interval over {_UNITS_IN_WORDS[data.groups]}",
         "leakage": leakage,
         "rows": rows,
-        "published": {"citation": PAPER, "data": SWEEP_DATA, "sweeps": PAPER_SWEEPS},
+        "published": {
+            "citation": PAPER,
+            "data": SWEEP_DATA,
+            "sweeps": PAPER_SWEEPS,
+            "accuracies": ACCURACIES,
+        },
         "machine": describe_machine(),
     }
 
@@ -307,6 +319,8 @@ def _row(cell: Cell, folds: Sequence[dict[str, Any]], units: NDArray[np.int64]) 
     if all("confidence" in fold for fold in folds):
         bins = np.sum([fold["confidence"] for fold in folds], axis=0)
         row["calibration_error"] = round(error_of_bins(bins), 4)
+    if all("update_us" in fold for fold in folds):
+        row["update_us"] = round(float(np.median([fold["update_us"] for fold in folds])), 3)
     for name in ("prequential", "early", "learned"):
         if name in folds[0] and not cell.swept:
             row[name] = folds[0][name]

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from streamfeat.evaluate.surfaces import until
+from streamfeat.evaluate.samples import downsampled, until
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.layout import BEFORE_TIME
 from streamfeat.kernels.spiking import spike_first, spike_leaky
@@ -48,10 +48,12 @@ def gabor_filters(side: int = 7, n_orientations: int = 12) -> NDArray[np.float64
 class _GridOfSpikes:
     """Spikes of each orientation, counted on a grid as large as the sample.
 
-    Args of the constructors of its kinds: rows and columns of the grid.
+    Args of the constructors of its kinds: rows and columns of the grid, and sensor pixels along each side
+    of a pixel of the network.
     """
 
     grid: int
+    downsample: int
     n_orientations: ClassVar[int] = 12
     kernel: ClassVar[Callable[..., None]]
 
@@ -69,6 +71,7 @@ class _GridOfSpikes:
         self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        events, resolution = downsampled(events, resolution, self.downsample)
         count = self.counter(resolution)
         counts = count(*until(events, resolution, origin_us, t_us))
         rows, columns = (np.arange(n) * self.grid // n for n in counts.shape[:2])
@@ -105,9 +108,11 @@ class FirstSpikes(_GridOfSpikes):
 
     Attributes:
         grid: rows and columns of the grid.
+        downsample: sensor pixels along each side of a pixel of all this.
     """
 
     grid: int = 8
+    downsample: int = 1
     kernel: ClassVar[Callable[..., None]] = staticmethod(spike_first)
 
     def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:
@@ -139,10 +144,12 @@ class LeakySpikes(_GridOfSpikes):
     Attributes:
         grid: rows and columns of the grid.
         tau_us: time in which a potential fades to 1/e.
+        downsample: sensor pixels along each side of a pixel of all this.
     """
 
     grid: int = 8
     tau_us: float = 10_000.0
+    downsample: int = 1
     kernel: ClassVar[Callable[..., None]] = staticmethod(spike_leaky)
 
     def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:

@@ -5,7 +5,7 @@ Not here: features made by filters (`methods`), and the loops over events (`kern
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +14,12 @@ from sklearn.cluster import MiniBatchKMeans
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from streamfeat.errors import InputError
+from streamfeat.evaluate.samples import downsampled, training_samples, until
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
-from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording, Sample
+from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording
 
-__all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram", "until"]
+__all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
 
 _FITTED_SAMPLES = 1_000
 """Training samples whose surfaces prototypes are learned from: enough for so few prototypes."""
@@ -63,22 +64,25 @@ class AveragedSurfaces:
     their normalisation every method's features have ours.
 
     Attributes:
-        resolution: largest `(height, width)` of a training sample; what lies beyond is ignored.
+        resolution: largest `(height, width)` of a training sample, downsampled; what lies beyond is ignored.
         cell: rows and columns of a cell, in pixels.
         radius: of a surface, in pixels.
         tau_us: time in which the past fades to 1/e.
+        downsample: sensor pixels along each side of a pixel of all this.
     """
 
     resolution: Resolution
     cell: int = 10
     radius: int = 3
     tau_us: float = 1e9
+    downsample: int = 1
 
     @classmethod
-    def fitted(cls, recordings: Sequence[Recording]) -> "AveragedSurfaces":
+    def fitted(cls, recordings: Sequence[Recording], downsample: int = 1) -> "AveragedSurfaces":
         """Cells over the largest training sample."""
-        height, width = np.max([s.resolution for s in _training(recordings)], axis=0).tolist()
-        return cls((height, width))
+        largest = np.max([s.resolution for s in training_samples(recordings)], axis=0)
+        height, width = (-(-largest // downsample)).tolist()
+        return cls((height, width), downsample=downsample)
 
     @property
     def n_features(self) -> int:
@@ -100,6 +104,7 @@ class AveragedSurfaces:
         self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        events, resolution = downsampled(events, resolution, self.downsample)
         inside = min(resolution[0], self.resolution[0]), min(resolution[1], self.resolution[1])
         x, y, p, t = until(events, inside, origin_us, t_us)
         sums = np.zeros(self.shape)
@@ -121,15 +126,22 @@ class SurfaceHistogram:
         prototypes: `(n, 2 (2 R + 1)^2)` float32.
         radius: of a surface, in pixels.
         tau_us: time in which a surface fades to 1/e.
+        downsample: sensor pixels along each side of a pixel of all this.
     """
 
     prototypes: NDArray[np.float32]
     radius: int = 3
     tau_us: float = 20_000.0
+    downsample: int = 1
 
     @classmethod
     def fitted(
-        cls, recordings: Sequence[Recording], n_prototypes: int = 64, n_surfaces: int = 50_000, seed: int = 0
+        cls,
+        recordings: Sequence[Recording],
+        n_prototypes: int = 64,
+        n_surfaces: int = 50_000,
+        seed: int = 0,
+        downsample: int = 1,
     ) -> "SurfaceHistogram":
         """Prototypes of the surfaces at random events of random training samples.
 
@@ -144,10 +156,11 @@ class SurfaceHistogram:
         each = -(-n_surfaces // max(len(chosen), 1))
         blank = cls(np.zeros((0, 0), np.float32))
         drawn = []
-        for i, sample in enumerate(_training(recordings)):
+        for i, sample in enumerate(training_samples(recordings)):
             if i not in chosen:
                 continue
-            surfaces = blank._surfaces(*until(sample.events, sample.resolution), sample.resolution)
+            events, resolution = downsampled(sample.events, sample.resolution, downsample)
+            surfaces = blank._surfaces(*until(events, resolution), resolution)
             if len(surfaces):
                 drawn.append(surfaces[rng.integers(0, len(surfaces), each)])
         if not drawn:
@@ -155,7 +168,7 @@ class SurfaceHistogram:
         means = MiniBatchKMeans(n_prototypes, batch_size=4096, n_init=1, random_state=seed)
         with threadpool_limits(1, user_api="openmp"):
             means.fit(np.concatenate(drawn))
-        return cls(means.cluster_centers_.astype(np.float32))
+        return cls(means.cluster_centers_.astype(np.float32), downsample=downsample)
 
     @property
     def n_features(self) -> int:
@@ -166,13 +179,14 @@ class SurfaceHistogram:
     def fingerprint(self) -> str:
         """Everything that decides what features are."""
         return hashlib.sha256(
-            repr((self.radius, self.tau_us)).encode() + self.prototypes.tobytes()
+            repr((self.radius, self.tau_us, self.downsample)).encode() + self.prototypes.tobytes()
         ).hexdigest()
 
     def encode(
         self, events: Events, resolution: Resolution, *, origin_us: int | None = None, t_us: int | None = None
     ) -> NDArray[np.float32]:
         """Features `(n_features,)` of the events from `origin_us` to `t_us`."""
+        events, resolution = downsampled(events, resolution, self.downsample)
         x, y, p, t = until(events, resolution, origin_us, t_us)
         surfaces = self._surfaces(x, y, p, t, resolution)
         # |s - c|^2 is least where c.s - |c|^2 / 2 is largest.
@@ -195,25 +209,3 @@ class SurfaceHistogram:
         out = np.empty((len(t), 2, side, side), np.float32)
         time_surfaces(x, y, p, t / self.tau_us, latest, out)
         return out.reshape(len(t), 2 * side * side)
-
-
-def _training(recordings: Sequence[Recording]) -> Iterator[Sample]:
-    """Samples of splits that are not held out."""
-    for recording in recordings:
-        for sample in recording.samples():
-            if sample.label.split not in HELD_OUT_SPLITS:
-                yield sample
-
-
-def until(
-    events: Events, resolution: Resolution, origin_us: int | None = None, t_us: int | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The events that count, in order of time: `x, y, p` and microseconds since the origin, `(n,)` int64."""
-    x, y, p, t = (events[name].astype(np.int64) for name in ("x", "y", "p", "t"))
-    if len(t) == 0:
-        return x, y, p, t
-    origin = int(t.min()) if origin_us is None else origin_us
-    last = int(t.max()) if t_us is None else t_us
-    keep = (x < resolution[1]) & (y < resolution[0]) & ((p == 0) | (p == 1)) & (t >= origin) & (t <= last)
-    order = np.flatnonzero(keep)[np.argsort(t[keep], kind="stable")]
-    return x[order], y[order], p[order], t[order] - origin

@@ -17,18 +17,21 @@ from numba import njit
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
+from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
 from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
 from streamfeat.events import Events, Resolution, is_valid
+from streamfeat.kernels.retina import describe_events
 from streamfeat.kernels.spiking import spike_first, spike_leaky
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
 from streamfeat.latency.stopwatch import Stamps, now
 from streamfeat.recordings.reader import Label, Packet
 
-__all__ = ["TIMED", "Live", "Method", "any_prototypes", "walk_method"]
+__all__ = ["TIMED", "Live", "Method", "any_prototypes", "any_words", "walk_method"]
 
 _CHUNK = 256
 _PROTOTYPES = 64
+_WORDS = 500
 
 Columns = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
@@ -142,6 +145,24 @@ def _hots(resolution: Resolution) -> Live:
     return Live(timed, counts.ravel)
 
 
+def any_words() -> NDArray[np.float32]:
+    """Words for DART, likewise."""
+    return np.random.default_rng(0).dirichlet(np.ones(84), _WORDS).astype(np.float32)
+
+
+def _dart(resolution: Resolution) -> Live:
+    features = RetinalWords(any_words())
+    half = np.square(features.words).sum(axis=1) / np.float32(2)
+    state, descriptor = features.state(resolution), np.empty((1, features.words.shape[1]), np.float32)
+    counts = np.zeros((4, _WORDS), np.int64)
+
+    def timed(columns: Columns) -> Stamps:
+        of_words = descriptor, descriptor.reshape(-1), features.words, half, *resolution, counts
+        return _told(_walk_dart, *columns[:2], *state, *of_words)
+
+    return Live(timed, counts.ravel)
+
+
 def _spikes(loop: Any, network: FirstSpikes | LeakySpikes) -> Callable[[Resolution], Live]:
     def make(resolution: Resolution) -> Live:
         clocked, state = network.state(resolution)
@@ -174,6 +195,19 @@ def _walk_hats(x, y, p, t, cell, memory, sums, counts, timespec, stamps):  # typ
 
 
 @njit(nogil=True)
+def _nearest(flat, prototypes, half):  # type: ignore[no-untyped-def]
+    """The prototype with the largest inner product, less half its square."""
+    best, most = 0, np.float32(-np.inf)
+    for k in range(prototypes.shape[0]):
+        likeness = -half[k]
+        for d in range(flat.shape[0]):
+            likeness += flat[d] * prototypes[k, d]
+        if likeness > most:
+            best, most = k, likeness
+    return best
+
+
+@njit(nogil=True)
 def _walk_hots(  # type: ignore[no-untyped-def]
     x, y, p, t, latest, surface, flat, prototypes, half, height, width, counts, timespec, stamps
 ):
@@ -181,14 +215,34 @@ def _walk_hots(  # type: ignore[no-untyped-def]
     for i in range(len(x)):
         j = i + 1
         time_surfaces(x[i:j], y[i:j], p[i:j], t[i:j], latest, surface)
-        best, most = 0, np.float32(-np.inf)
-        for k in range(prototypes.shape[0]):
-            likeness = -half[k]
-            for d in range(flat.shape[0]):
-                likeness += flat[d] * prototypes[k, d]
-            if likeness > most:
-                best, most = k, likeness
+        best = _nearest(flat, prototypes, half)
         counts[2 * (2 * y[i] >= height) + (2 * x[i] >= width), best] += 1
+        stamps[j] = now(timespec)
+
+
+@njit(nogil=True)
+def _walk_dart(  # type: ignore[no-untyped-def]
+    x,
+    y,
+    places,
+    recent,
+    queue,
+    head,
+    descriptor,
+    flat,
+    words,
+    half,
+    height,
+    width,
+    counts,
+    timespec,
+    stamps,
+):
+    stamps[0] = now(timespec)
+    for i in range(len(x)):
+        j = i + 1
+        describe_events(x[i:j], y[i:j], places, recent, queue, head, descriptor)
+        counts[2 * (2 * y[i] >= height) + (2 * x[i] >= width), _nearest(flat, words, half)] += 1
         stamps[j] = now(timespec)
 
 
@@ -230,6 +284,7 @@ def _walk_counts(x, y, p, height, width, counts, timespec, stamps):  # type: ign
 TIMED: dict[str, tuple[str, Callable[[Resolution], Live]]] = {
     "hats": ("HATS, surfaces of 7x7 summed in cells of 10x10", _hats),
     "hots": (f"HOTS, one layer, {_PROTOTYPES} prototypes of 2x7x7, by plain loops", _hots),
+    "dart": (f"DART, {_WORDS} words of 7x12, 2,000 events remembered, by plain loops", _dart),
     "hfirst": ("HFirst, layers S1 and C1, 12 orientations of 7x7", _spikes(_walk_first, FirstSpikes())),
     "gabor-snn": ("Gabor-SNN, 12 orientations of 7x7", _spikes(_walk_leaky, LeakySpikes())),
     "counts": ("count images of 2x16x16", _counts),
