@@ -132,7 +132,7 @@ def change_entries(
     change_moments(n, entries, changes, values, operator, moments)
 
 
-@kernel
+@inlined
 def gather_volume(
     ring: NDArray[np.int16],
     first_slot: int,
@@ -177,7 +177,7 @@ def gather_volume(
         line = following
 
 
-@kernel
+@inlined
 def list_entries(
     values: NDArray[np.int16],
     start: int,

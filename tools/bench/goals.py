@@ -295,7 +295,7 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = [name for name in options.only.split(",") if name not in ROWS]
     if unknown:
         parser.error(f"--only {','.join(unknown)}: rows are {', '.join(ROWS)}")
-    trees = {"before": Tree(options.before), "now": Tree(ROOT)}
+    trees = {"before": Tree(options.before, anew=True), "now": Tree(ROOT, anew=True)}
     print(f"load of the machine {os.getloadavg()[0]:.1f}\n\n| figure | goal | seen | |\n|---|---:|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(

@@ -118,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--picture", type=Path, default=Path(__file__).with_name("curves.svg"))
     parser.add_argument("--only", choices=("profiles", "curves"), help="one of the two")
     options = parser.parse_args(arguments)
-    trees = {"before": Tree(options.before), "now": Tree(ROOT)}
+    trees = {"before": Tree(options.before, anew=True), "now": Tree(ROOT, anew=True)}
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(
             trees, options.samples, options.recording, Path(folder), options.rounds, options.emissions

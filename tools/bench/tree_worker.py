@@ -182,8 +182,20 @@ TASKS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 }
 
 
+def compile_kernels() -> None:
+    """Compile as a command does before its first packet, where the version has a way to."""
+    try:
+        from streamfeat.stream.compiling import compile_together
+    except ImportError:
+        return
+    for narrow in (False, True):
+        compile_together(narrow=narrow)
+
+
 def main() -> None:
     """Do tasks until there are no more."""
+    if "compile" in sys.argv[1:]:
+        compile_kernels()
     for line in sys.stdin:
         task = json.loads(line)
         gc.collect()

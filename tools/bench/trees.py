@@ -4,10 +4,12 @@ Lives here: starting them, asking them, medians and ratios of one round.
 Not here: the tasks (`tree_worker`), what is asked for (`goals`, `profile`).
 """
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,20 +30,30 @@ class TreeError(Exception):
 class Tree:
     """One version: a checkout with a `.venv` of its own, or one that this interpreter can run.
 
+    What LLVM makes of a kernel depends on those that were compiled before it: a cache that tests had filled
+    was seen to be a third slower than one that a command had.
+
     Args:
         root: of the checkout.
+        anew: compile its kernels anew, as a command does; else take what its cache holds.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, anew: bool = False) -> None:
         """Start its process."""
         own = root / ".venv" / "bin" / "python"
+        self._opened = contextlib.ExitStack()
+        environment = os.environ | {"PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1"}
+        if anew:
+            folder = tempfile.TemporaryDirectory(prefix="streamfeat-kernels-")
+            environment["NUMBA_CACHE_DIR"] = self._opened.enter_context(folder)
         self._process = subprocess.Popen(
             [
                 str(own) if own.exists() else sys.executable,
                 "-P",
                 str(Path(__file__).with_name("tree_worker.py")),
+                *["compile"][:anew],
             ],
-            env=os.environ | {"PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1"},
+            env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -68,6 +80,7 @@ class Tree:
     def close(self) -> None:
         """End its process."""
         self._process.communicate()
+        self._opened.close()
 
 
 @dataclass(frozen=True)
