@@ -181,7 +181,9 @@ class _Interrupts:
             until = self._leave_at_s
             if not poll.poll(None if until is None else max(0, 1000 * (until - time.monotonic()))):
                 if self._leave_at_s is not None and time.monotonic() >= self._leave_at_s:
-                    self.leave()
+                    if not self.phase.is_promised:
+                        self.leave()
+                    self._leave_at_s = None  # something was promised after the interrupt was heard
                 continue
             number = os.read(end, 1)[0]
             if number == _QUIT:
