@@ -32,8 +32,21 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+BEGUN_FIRST = (
+    "test_processors",
+    "test_bench",
+    "test_invariants",
+    "test_kernels",
+    "test_cluster",
+    "test_scales",
+)
+"""Files that take a minute and more: with two workers, none of them is to be left alone at the end."""
+
+
 def pytest_collection_modifyitems(items):
-    """Try tests of real networks, processes and clocks again: others use the same machine."""
+    """Begin with what takes long, and try tests of real networks, processes and clocks again."""
+    turns = {name: turn for turn, name in enumerate(BEGUN_FIRST)}
+    items.sort(key=lambda item: turns.get(item.path.stem, len(turns)))
     for item in items:
         if item.get_closest_marker("real_time"):
             item.add_marker(pytest.mark.flaky(reruns=2))

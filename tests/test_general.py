@@ -25,7 +25,7 @@ def home(tmp_path_factory):
     )
     assert found.exit_code == 0, found.output
     assert SAID in found.stderr
-    assert json.loads(found.stdout)["held_out_accuracy"] > 0.3
+    assert json.loads(found.stdout)["held_out_accuracy"] > 0.2  # chance is 0.1
     return home
 
 

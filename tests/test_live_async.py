@@ -33,8 +33,18 @@ def cdr(events, seq):
     return EventPacket(0, "", *tiny.RESOLUTION, seq, base_ns, "mono", False, payload).to_cdr()
 
 
+@pytest.fixture(autouse=True)
+def before():
+    """Threads that tests of other files have left."""
+    THEIRS[:] = threading.enumerate()
+
+
+THEIRS = []
+
+
 def ours():
-    return [t.name for t in threading.enumerate() if t.name.startswith("streamfeat")]
+    """Threads of this project that a test has started."""
+    return [t.name for t in threading.enumerate() if t.name.startswith("streamfeat") and t not in THEIRS]
 
 
 def test_emissions_of_live_topics_have_the_bits_of_the_offline_path(files):

@@ -163,7 +163,7 @@ def test_commands_learn_and_use_rectangles_and_whole_sensors(run, tmp_path):
     run("learn", path, *options, "--patch", "4x7", "-o", tmp_path / "model")
     assert Encoder.load(tmp_path / "model").geometry.sides == (4, 7)
     files = ["-m", tmp_path / "model", "-c", tmp_path / "classifier"]
-    trained = run("train", path, *files[:2], "-o", files[3], "--mirror", "--json").json
+    trained = run("train", path, *files[:2], "-o", files[3], "--kernel=linear", "--mirror", "--json").json
     said = run("replay", path, *files, "--emit", "event", "--split", "test", "--json").json
     assert said["correct"] / 20 == pytest.approx(trained["held_out_accuracy"])
     sweep = ["--patch=4x7", "--sweep", "patch=sensor", "--downsample", "4", "--early-samples", 0]
