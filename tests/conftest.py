@@ -7,6 +7,7 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what it runs in the background so, and every process that a test starts would inherit it.
@@ -105,7 +106,8 @@ def run(monkeypatch, capfd):
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["streamfeat", *map(str, arguments)])
         capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
+        # Options that hold for what a command opens are handed on in the environment.
+        with patch.dict(os.environ), pytest.raises(SystemExit) as end:
             cli.main()
         said = capfd.readouterr()
         return Result(end.value.code or 0, said.out, said.err)
