@@ -141,7 +141,7 @@ def test_no_float_copy_of_all_volumes_is_made(learner):
     make.fit(volumes)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < n * d * 4 / 2
+    assert peak < n * d * 4 * 3 / 4
 
 
 def test_few_volumes_are_whitened_once_and_many_on_every_pass(monkeypatch):
