@@ -75,6 +75,17 @@ def pytest_terminal_summary(terminalreporter):
     terminalreporter.line(f"tried again: {len(again)} times, {len(set(again))} tests of real time")
 
 
+@pytest.fixture(scope="module")
+def every_update_is_worth_a_thread():
+    """Engines of several threads share the smallest update: all that holds for one is tried with them."""
+    from streamfeat.engine import threads
+
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(threads, "WORTH_A_PART", 1)
+        context.setattr(threads, "WORTH_COUNTING", 0)
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings, which are not part of the repository."""

@@ -26,7 +26,6 @@ from streams import (
 
 from streamfeat.camera_files.event_files import open_events
 from streamfeat.classify.classifier import Classifier
-from streamfeat.engine import threads
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
 from streamfeat.events import make_events
@@ -37,13 +36,7 @@ EXAMPLES = 25
 ids = "-".join
 
 
-@pytest.fixture(autouse=True, scope="module")
-def every_update_is_worth_a_thread():
-    """Engines of several threads share the smallest update: all that holds for one is tried with them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threads, "WORTH_A_PART", 1)
-        patch.setattr(threads, "WORTH_COUNTING", 0)
-        yield
+pytestmark = pytest.mark.usefixtures("every_update_is_worth_a_thread")
 
 
 MEANINGFUL = ("counts", "applied", "is_touched", "is_dirty")

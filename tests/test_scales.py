@@ -15,7 +15,6 @@ from streams import EXACT_KINDS, LASSO_KINDS, Case, cases, fed_in_every_way, mix
 
 from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.features import EventFeatures
-from streamfeat.engine import threads
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
@@ -31,12 +30,7 @@ EXAMPLES = 25
 ids = "-".join
 
 
-@pytest.fixture(autouse=True, scope="module")
-def every_update_is_worth_a_thread():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threads, "WORTH_A_PART", 1)
-        patch.setattr(threads, "WORTH_COUNTING", 0)
-        yield
+pytestmark = pytest.mark.usefixtures("every_update_is_worth_a_thread")
 
 
 @dataclass(frozen=True)

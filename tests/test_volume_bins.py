@@ -22,7 +22,6 @@ from streams import (
 from test_invariants import lasso_bound, now_us
 
 from streamfeat.classify.classifier import Classifier
-from streamfeat.engine import threads
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.engine import Engine
 from streamfeat.engine.geometry import Geometry
@@ -38,12 +37,7 @@ EXAMPLES = 15
 ids = "-".join
 
 
-@pytest.fixture(autouse=True, scope="module")
-def every_update_is_worth_a_thread():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threads, "WORTH_A_PART", 1)
-        patch.setattr(threads, "WORTH_COUNTING", 0)
-        yield
+pytestmark = pytest.mark.usefixtures("every_update_is_worth_a_thread")
 
 
 @st.composite

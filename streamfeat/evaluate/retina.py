@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import MiniBatchKMeans
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from streamfeat.errors import InputError
-from streamfeat.evaluate.samples import downsampled, training_samples, until
+from streamfeat.evaluate.samples import centres, downsampled, some_training_samples, until
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.retina import describe_events
-from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording
+from streamfeat.recordings.reader import Recording
 
 __all__ = ["RetinalWords", "log_polar_places"]
 
@@ -91,16 +89,11 @@ class RetinalWords:
             InputError: there is no event.
         """
         rng = np.random.default_rng(seed)
-        n_samples = sum(
-            label.split not in HELD_OUT_SPLITS for recording in recordings for label in recording.labels
-        )
-        chosen = set(rng.permutation(n_samples)[:_FITTED_SAMPLES].tolist())
-        each = -(-n_descriptors // max(len(chosen), 1))
+        n_samples, samples = some_training_samples(recordings, _FITTED_SAMPLES, rng)
+        each = -(-n_descriptors // max(n_samples, 1))
         blank = cls(np.zeros((0, 0), np.float32), downsample=downsample)
         drawn = []
-        for i, sample in enumerate(training_samples(recordings)):
-            if i not in chosen:
-                continue
+        for sample in samples:
             events, resolution = downsampled(sample.events, sample.resolution, downsample)
             x, y, _, _ = until(events, resolution)
             picked = np.sort(rng.integers(0, max(len(x), 1), each))
@@ -110,10 +103,7 @@ class RetinalWords:
         descriptors = np.concatenate(drawn) if drawn else np.zeros((0, 1), np.float32)
         if not len(descriptors):
             raise InputError("the training samples have no events; dart has nothing to learn from")
-        means = MiniBatchKMeans(min(n_words, len(descriptors)), batch_size=4096, n_init=1, random_state=seed)
-        with threadpool_limits(1, user_api="openmp"):
-            means.fit(descriptors)
-        return cls(means.cluster_centers_.astype(np.float32), downsample=downsample)
+        return cls(centres(descriptors, min(n_words, len(descriptors)), seed), downsample=downsample)
 
     @property
     def n_features(self) -> int:

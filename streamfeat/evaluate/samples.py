@@ -8,11 +8,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.cluster import MiniBatchKMeans
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from streamfeat.events import Events, Resolution
 from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording, Sample
 
-__all__ = ["downsampled", "training_samples", "until"]
+__all__ = ["centres", "downsampled", "some_training_samples", "training_samples", "until"]
 
 
 def training_samples(recordings: Sequence[Recording]) -> Iterator[Sample]:
@@ -21,6 +23,25 @@ def training_samples(recordings: Sequence[Recording]) -> Iterator[Sample]:
         for sample in recording.samples():
             if sample.label.split not in HELD_OUT_SPLITS:
                 yield sample
+
+
+def some_training_samples(
+    recordings: Sequence[Recording], most: int, rng: np.random.Generator
+) -> tuple[int, Iterator[Sample]]:
+    """How many of the training samples are drawn at random, `most` at most; and these, in stream order."""
+    labels = (label for recording in recordings for label in recording.labels)
+    n_samples = sum(label.split not in HELD_OUT_SPLITS for label in labels)
+    chosen = set(rng.permutation(n_samples)[:most].tolist())
+    return len(chosen), (s for i, s in enumerate(training_samples(recordings)) if i in chosen)
+
+
+def centres(vectors: NDArray[np.float32], n: int, seed: int) -> NDArray[np.float32]:
+    """`n` centres of vectors by k-means in batches, on one thread: `(n, d)` float32."""
+    means = MiniBatchKMeans(n, batch_size=4096, n_init=1, random_state=seed)
+    with threadpool_limits(1, user_api="openmp"):
+        means.fit(vectors)
+    found: NDArray[np.float32] = means.cluster_centers_.astype(np.float32)
+    return found
 
 
 def downsampled(events: Events, resolution: Resolution, times: int) -> tuple[Events, Resolution]:

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import MiniBatchKMeans
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from streamfeat.errors import InputError
-from streamfeat.evaluate.samples import downsampled, training_samples, until
+from streamfeat.evaluate.samples import centres, downsampled, some_training_samples, training_samples, until
 from streamfeat.events import Events, Resolution
 from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
-from streamfeat.recordings.reader import HELD_OUT_SPLITS, Recording
+from streamfeat.recordings.reader import Recording
 
 __all__ = ["AveragedSurfaces", "CountImage", "SurfaceHistogram"]
 
@@ -149,26 +147,18 @@ class SurfaceHistogram:
             InputError: there is no event.
         """
         rng = np.random.default_rng(seed)
-        n_samples = sum(
-            label.split not in HELD_OUT_SPLITS for recording in recordings for label in recording.labels
-        )
-        chosen = set(rng.permutation(n_samples)[:_FITTED_SAMPLES].tolist())
-        each = -(-n_surfaces // max(len(chosen), 1))
+        n_samples, samples = some_training_samples(recordings, _FITTED_SAMPLES, rng)
+        each = -(-n_surfaces // max(n_samples, 1))
         blank = cls(np.zeros((0, 0), np.float32))
         drawn = []
-        for i, sample in enumerate(training_samples(recordings)):
-            if i not in chosen:
-                continue
+        for sample in samples:
             events, resolution = downsampled(sample.events, sample.resolution, downsample)
             surfaces = blank._surfaces(*until(events, resolution), resolution)
             if len(surfaces):
                 drawn.append(surfaces[rng.integers(0, len(surfaces), each)])
         if not drawn:
             raise InputError("the training samples have no events; hots has nothing to learn from")
-        means = MiniBatchKMeans(n_prototypes, batch_size=4096, n_init=1, random_state=seed)
-        with threadpool_limits(1, user_api="openmp"):
-            means.fit(np.concatenate(drawn))
-        return cls(means.cluster_centers_.astype(np.float32), downsample=downsample)
+        return cls(centres(np.concatenate(drawn), n_prototypes, seed), downsample=downsample)
 
     @property
     def n_features(self) -> int:
