@@ -14,6 +14,7 @@ from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.kernel import train_kernel_classifier
 from streamfeat.classify.variants import Variant
 from streamfeat.errors import InputError
+from streamfeat.evaluate import feature_files
 from streamfeat.evaluate.scores import predict_all
 from streamfeat.recordings.reader import Label
 
@@ -115,6 +116,28 @@ def test_a_sweep_of_mirror_images_at_test_shares_features(run, home):
     # Training on mirror images has the same rows whether or not they are needed at test as well.
     trained = evaluated(run, home, "--mirror").json["rows"][0]
     assert trained["hits"] == rows["mirror", False]["hits"]
+
+
+# Features that are kept
+
+
+def test_kept_features_are_those_that_would_have_been_encoded(run, home, monkeypatch, tmp_path):
+    options = ["--test-mirror", "--features", tmp_path]
+    alone = evaluated(run, home, "--test-mirror").json["rows"][0]
+    assert evaluated(run, home, *options).json["rows"][0]["hits"] == alone["hits"]
+    kept = sorted(tmp_path.iterdir())
+    assert len(kept) == 2  # of the samples and of their mirror images
+    monkeypatch.setattr(feature_files, "encode_recordings", None)
+    assert evaluated(run, home, *options, "--sweep", "mirror=yes").json["rows"][0]["hits"] == alone["hits"]
+    # Of other samples, or with another model, nothing fits.
+    MODEL.save(tmp_path / "again.model")
+    assert evaluated(run, home, "-m", tmp_path / "again.model", *options).status == 0
+    tiny.encoder(k=3).save(tmp_path / "other.model")
+    with pytest.raises(TypeError):
+        evaluated(run, home, "-m", tmp_path / "other.model", *options)
+    kept[0].write_bytes(kept[1].read_bytes())
+    refused = evaluated(run, home, *options)
+    assert (refused.status, "does not hold the features" in " ".join(refused.err.split())) == (2, True)
 
 
 # Calibration over folds

@@ -22,6 +22,7 @@ from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.codes import code_statistics
 from streamfeat.evaluate.costs import update_us
+from streamfeat.evaluate.feature_files import FeatureFiles
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
@@ -51,18 +52,20 @@ def run_cells(
     early_samples: int,
     workers: Workers = THIS_PROCESS,
     costs: bool = False,
+    kept: FeatureFiles | None = None,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells that the same features serve; results are JSON values.
 
-    Early decision, prequential accuracy and filters are of the base setting and the first fold.
+    Early decision is of the base setting, prequential accuracy and filters are of its first fold.
 
     Args:
         data: the recordings.
         cells: what to run; features are made once, also for several folds where those do not change them.
         report: told about progress.
-        early_samples: held-out samples for early decision; none if 0.
+        early_samples: held-out samples for early decision, from all folds together; none if 0.
         workers: learn and encode; see `make_features`.
         costs: time an update of one event, where the method has an encoder.
+        kept: features that do not depend on the fold are kept there.
 
     Yields:
         each cell and its result as soon as it is done.
@@ -72,6 +75,7 @@ def run_cells(
     """
     cell = cells[0]
     fold = None if cell.has_features_of_all_folds else cell.fold
+    encode = kept.encoded if kept and fold is None else encode_recordings
     with data.open(fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
@@ -82,13 +86,13 @@ def run_cells(
                 update_us(features, _samples(recordings)) if costs and isinstance(features, Encoder) else None
             )
             encoding = time.perf_counter()
-            samples = encode_recordings(features, recordings, report, workers=workers)
+            samples = encode(features, recordings, report, workers=workers)
             seconds = {PLAIN: time.perf_counter() - encoding}
             others: dict[Variant, EncodedSamples] = {}
             images: EncodedSamples | None = None
             if any(cell.setting.test_mirror for cell in cells):
                 started_one = time.perf_counter()
-                images = encode_recordings(
+                images = encode(
                     features, recordings, report, variant=_MIRRORED, held_out_too=True, workers=workers
                 )
                 seconds[_MIRRORED] = time.perf_counter() - started_one
@@ -96,21 +100,20 @@ def run_cells(
             wanted = dict.fromkeys(v for cell in cells for v in cell.setting.variants)
             for variant in [v for v in wanted if v not in others]:
                 started_one = time.perf_counter()
-                others[variant] = encode_recordings(
-                    features, recordings, report, variant=variant, workers=workers
-                )
+                others[variant] = encode(features, recordings, report, variant=variant, workers=workers)
                 seconds[variant] = time.perf_counter() - started_one
         for cell in cells:
             with PeakMemory() as training:
                 variants = cell.setting.variants
                 split = _split(samples, [others[v] for v in variants], data, cell if fold is None else None)
                 result = _scored(cell, data, features, *split, images, report)
-                if cell.fold == 0 and not cell.swept:
-                    classifier = result["classifier"]
-                    result |= _looked_into(
-                        cell, features, classifier, split[0], recordings, report, early_samples
+                classifier = result.pop("classifier")
+                if not cell.swept:
+                    result |= _early(
+                        cell, data, features, classifier, split[0], recordings, report, early_samples
                     )
-            del result["classifier"]
+                    if cell.fold == 0:
+                        result |= _looked_into(cell, features, split[0], recordings, report)
             if cost is not None:
                 result["update_us"] = round(cost, 3)
             result["learn_s"] = round(learned - started, 3)
@@ -205,8 +208,9 @@ def _confidence(
     return {"confidence": confidence_bins(likely, places).round(4).tolist()}
 
 
-def _looked_into(
+def _early(
     cell: Cell,
+    data: DataSet,
     features: FeatureMap,
     classifier: Classifier | KernelClassifier,
     samples: EncodedSamples,
@@ -214,7 +218,26 @@ def _looked_into(
     report: Report,
     early_samples: int,
 ) -> dict[str, Any]:
-    """Results that are made for the base setting only."""
+    """Early decision on a fold's part of so many samples."""
+    wanted = early_samples // data.n_folds + (cell.fold < early_samples % data.n_folds)
+    chosen = _evenly(recordings, samples.held_out.tolist(), wanted, report) if wanted else []
+    if not chosen:
+        return {}
+    report("early decision", 0, 1, f"{len(chosen)} samples")
+    longest = max(label.duration_us for labels in data.labels for label in labels)
+    found = early_decision(features, classifier, chosen, longest)
+    report("early decision", 1, 1, "")
+    return {"early": {"samples": len(chosen), **found}}
+
+
+def _looked_into(
+    cell: Cell,
+    features: FeatureMap,
+    samples: EncodedSamples,
+    recordings: Sequence[Recording],
+    report: Report,
+) -> dict[str, Any]:
+    """Results that are made for the base setting and the first fold only."""
     report("prequential", 0, 1, "")
     order = np.random.default_rng(cell.setting.seed).permutation(len(samples.labels))
     labels = samples.labels.tolist()
@@ -225,14 +248,8 @@ def _looked_into(
         }
     }
     report("prequential", 1, 1, "")
-    held_out = samples.held_out.tolist()
-    chosen = _evenly(recordings, held_out, early_samples, report) if early_samples else []
-    if chosen:
-        report("early decision", 0, 1, f"{len(chosen)} samples")
-        result["early"] = {"samples": len(chosen), **early_decision(features, classifier, chosen)}
-        report("early decision", 1, 1, "")
     if isinstance(features, Encoder):
-        some = _evenly(recordings, held_out, _CODED_SAMPLES, report)
+        some = _evenly(recordings, samples.held_out.tolist(), _CODED_SAMPLES, report)
         result["learned"] = _learned(features) | code_statistics(features, some, cell.setting.seed)
     return result
 

@@ -297,8 +297,8 @@ def notes(result: dict[str, Any]) -> list[str]:
     if early:
         lines.append(
             f"Early decision: {early['samples']:,} held-out samples, cut off after some time or some events; "
-            "the window ends at the cut, the classifier was trained on whole samples. Times are the first "
-            "measured points from which on the accuracy stays above the share."
+            "the window ends at the cut. Times are the first measured points from which on the accuracy "
+            "stays above the share."
         )
     online = next((row["prequential"] for row in result["rows"] if "prequential" in row), None)
     if online:
