@@ -7,7 +7,7 @@ import pytest
 import tiny
 
 from streamfeat.classify.features import encode_recordings, training_set
-from streamfeat.classify.variants import PLAIN, Variant, parse_cuts, variants_of
+from streamfeat.classify.variants import DRAWN, PLAIN, Variant, parse_cuts, variants_of
 from streamfeat.engine.encoder import Encoder
 from streamfeat.engine.geometry import Geometry
 from streamfeat.errors import InputError
@@ -69,6 +69,23 @@ def test_a_cut_sample_ends_where_its_window_does():
         assert np.array_equal(same.events, whole.events)
 
 
+def test_a_beginning_is_drawn_for_each_sample_from_its_label_alone():
+    begun = Variant(cut_us=DRAWN)
+    samples = [sample(start_us=1000 * i, duration_us=1000) for i in range(300)]
+    lengths = np.array([begun.of(one).label.duration_us for one in samples])
+    assert 100 <= lengths.min() < 130
+    assert 970 < lengths.max() < 1000
+    assert abs(lengths.mean() - 550) < 3 * 260 / np.sqrt(300)
+    np.testing.assert_array_equal(lengths, [begun.of(one).label.duration_us for one in samples])
+    for one, length in zip(samples, lengths, strict=True):
+        cut, whole = begun.of(one).events["t"], one.events["t"]
+        np.testing.assert_array_equal(cut, whole[whole < one.label.start_us + length])
+    images = [Variant(mirror=True, cut_us=DRAWN).of(one).label.duration_us for one in samples]
+    assert abs(np.corrcoef(lengths, images)[0, 1]) < 0.3
+    for short in (1, 2, 3):
+        assert 1 <= begun.of(sample(duration_us=short)).label.duration_us <= short
+
+
 def test_a_moved_sample_loses_what_leaves_the_sensor():
     whole = sample()
     height, width = whole.resolution
@@ -100,7 +117,13 @@ def test_which_variants_options_ask_for():
 
 @pytest.mark.parametrize(
     ("text", "cuts"),
-    [("", ()), ("33+67", (33_000, 67_000)), ("67, 33.5", (33_500, 67_000)), ("5+5", (5_000,))],
+    [
+        ("", ()),
+        (" any ", (DRAWN,)),
+        ("33+67", (33_000, 67_000)),
+        ("67, 33.5", (33_500, 67_000)),
+        ("5+5", (5_000,)),
+    ],
 )
 def test_cuts_are_milliseconds(text, cuts):
     assert parse_cuts(text) == cuts

@@ -102,12 +102,15 @@ def run_cells(
                 started_one = time.perf_counter()
                 others[variant] = encode(features, recordings, report, variant=variant, workers=workers)
                 seconds[variant] = time.perf_counter() - started_one
-        for cell in cells:
+        trained: tuple[Any, ...] = ()
+        for cell in sorted(cells, key=_training):
             with PeakMemory() as training:
                 variants = cell.setting.variants
                 split = _split(samples, [others[v] for v in variants], data, cell if fold is None else None)
-                result = _scored(cell, data, features, *split, images, report)
-                classifier = result.pop("classifier")
+                if _training(cell) not in trained:
+                    trained = (_training(cell), *_trained(cell, data, features, *split, report))
+                _, classifier, train_s = trained
+                result = _scored(cell, data, features, split[0], classifier, images)
                 if not cell.swept:
                     result |= _early(
                         cell, data, features, classifier, split[0], recordings, report, early_samples
@@ -116,6 +119,7 @@ def run_cells(
                         result |= _looked_into(cell, features, split[0], recordings, report)
             if cost is not None:
                 result["update_us"] = round(cost, 3)
+            result["train_s"] = round(train_s, 3)
             result["learn_s"] = round(learned - started, 3)
             encoded = {PLAIN, *variants} | ({_MIRRORED} if cell.setting.test_mirror else set())
             result["encode_s"] = round(sum(seconds[v] for v in encoded), 3)
@@ -162,30 +166,49 @@ def _of(samples: EncodedSamples, some: NDArray[np.bool_]) -> EncodedSamples:
     return EncodedSamples(rows, labels, sources, samples.held_out[some])
 
 
-def _scored(
+def _training(cell: Cell) -> tuple[int, str]:
+    """Equal for cells of the same features that one classifier serves."""
+    return cell.fold, repr(replace(cell.setting, test_mirror=False))
+
+
+def _trained(
     cell: Cell,
     data: DataSet,
     features: FeatureMap,
     samples: EncodedSamples,
     others: Sequence[EncodedSamples],
-    images: EncodedSamples | None,
     report: Report,
-) -> dict[str, Any]:
-    """Train and score; the classifier is part of what is found."""
+) -> tuple[Classifier | KernelClassifier, float]:
+    """The classifier of a cell, and the seconds that it took."""
     started = time.perf_counter()
     report("training", 0, 0, f"{_INNER_FOLDS}-fold cross-validation")
     rows, labels, numbers = training_set(samples, others)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
     classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True)
-    trained = time.perf_counter()
+    seconds = time.perf_counter() - started
     report("training", 1, 1, "")
-    mirrored = images.rows[samples.held_out] if images and cell.setting.test_mirror else None
-    predicted = predict_all(classifier, samples.rows[samples.held_out], mirrored)
-    true = samples.labels[samples.held_out].tolist()
-    result: dict[str, Any] = {} if mirrored is not None else _confidence(classifier, samples)
+    return classifier, seconds
+
+
+def _scored(
+    cell: Cell,
+    data: DataSet,
+    features: FeatureMap,
+    samples: EncodedSamples,
+    classifier: Classifier | KernelClassifier,
+    images: EncodedSamples | None,
+) -> dict[str, Any]:
+    """How well a classifier does on the held-out samples; with mirror images there are no probabilities."""
+    rows, true = samples.rows[samples.held_out], samples.labels[samples.held_out].tolist()
+    result: dict[str, Any] = {}
+    if images and cell.setting.test_mirror:
+        predicted = predict_all(classifier, rows, images.rows[samples.held_out])
+    else:
+        likely = classifier.emitted(rows)
+        predicted = [classifier.labels[i] for i in likely.argmax(axis=-1)]
+        result["confidence"] = _confidence(classifier.labels, likely, true)
     return result | {
-        "classifier": classifier,
         "samples": [int(np.sum(~samples.held_out)), len(true)],
         # A digit for each held-out sample in stored order: settings are compared sample by sample.
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
@@ -193,19 +216,15 @@ def _scored(
         "features": features.n_features,
         "C": classifier.provenance.get("C"),
         "kernel": "rbf" if isinstance(classifier, KernelClassifier) else "linear",
-        "train_s": round(trained - started, 3),
     }
 
 
-def _confidence(
-    classifier: Classifier | KernelClassifier, samples: EncodedSamples
-) -> dict[str, list[list[float]]]:
+def _confidence(labels: Sequence[str], likely: NDArray[np.float32], true: Sequence[str]) -> list[list[float]]:
     """For the error of calibration over all folds: bins of the held-out samples whose label is known."""
-    true = samples.labels[samples.held_out]
-    known = np.isin(true, classifier.labels)
-    places = np.searchsorted(classifier.labels, true[known])
-    likely = classifier.emitted(samples.rows[samples.held_out][known])
-    return {"confidence": confidence_bins(likely, places).round(4).tolist()}
+    known = np.isin(true, labels)
+    places = np.searchsorted(labels, np.array(true)[known])
+    found: list[list[float]] = confidence_bins(likely[known], places).round(4).tolist()
+    return found
 
 
 def _early(
