@@ -17,13 +17,10 @@ import numpy as np
 from streamfeat.errors import InputError
 from streamfeat.recordings.reader import Label, Sample
 
-__all__ = ["DRAWN", "PLAIN", "Variant", "parse_cuts", "variants_of"]
-
-DRAWN = -1
-"""In place of a time after which samples are cut: one that is drawn for each of them."""
+__all__ = ["PLAIN", "Variant", "parse_cuts", "variants_of"]
 
 _ANY = "any"
-_LEAST_SHARE = 10
+_LEAST_SHARE = 0.1
 _MOST_CUTS = 8
 _MOST_SHIFT = 1024
 
@@ -35,8 +32,8 @@ class Variant:
     Attributes:
         mirror: columns from right to left.
         shift: `(rows, columns)` by which events move; those that leave the sensor are lost.
-        cut_us: the sample is seen for so long only; 0 for all of it; `DRAWN` for a time between a tenth and
-            all of it, which depends on nothing but its label and on whether it is mirrored.
+        cut_us: the sample is seen for so long only; 0 for all of it. Below zero, for a time that is drawn for
+            each sample; -1, -2 and so on are different draws.
     """
 
     mirror: bool = False
@@ -49,7 +46,7 @@ class Variant:
         An event outside the sensor stays outside. A sample that is no longer than the cut stays whole.
         """
         label, events = sample.label, sample.events
-        cut_us = self._drawn(label) if self.cut_us == DRAWN else self.cut_us
+        cut_us = self._drawn(label) if self.cut_us < 0 else self.cut_us
         if 0 < cut_us < label.duration_us:
             label = replace(label, duration_us=cut_us)
             t = events["t"]
@@ -67,18 +64,20 @@ class Variant:
         return Sample(label, events, sample.resolution)
 
     def _drawn(self, label: Label) -> int:
-        """Microseconds, each from a tenth to all of the sample as likely as any other."""
-        text = f"{label.source} {label.start_us} {self.mirror}"
-        draw = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest())
-        least = max(label.duration_us // _LEAST_SHARE, 1)
-        return least + draw % max(label.duration_us - least, 1)
+        """Microseconds from a tenth to all of the sample, by its label and this variant alone.
+
+        The logarithm is uniform: what is new in a further millisecond becomes less and less.
+        """
+        text = f"{label.source} {label.start_us} {self.mirror} {self.cut_us}"
+        draw = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
+        return max(1, round(label.duration_us * _LEAST_SHARE ** (draw / 2**32)))
 
     def __str__(self) -> str:
         """What it is, in words."""
         words = ["mirrored"] if self.mirror else []
         words += [f"moved by {self.shift[0]}, {self.shift[1]}"] if self.shift != (0, 0) else []
-        if self.cut_us:
-            words += ["a beginning" if self.cut_us == DRAWN else f"first {self.cut_us / 1000:g} ms"]
+        words += [f"first {self.cut_us / 1000:g} ms"] if self.cut_us > 0 else []
+        words += [f"beginning {-self.cut_us}"] if self.cut_us < 0 else []
         return ", ".join(words) or "as it is"
 
 
@@ -87,24 +86,23 @@ PLAIN = Variant()
 
 
 def parse_cuts(text: str) -> tuple[int, ...]:
-    """Microseconds of cuts such as `33+67`, in milliseconds; `any` is one that is drawn for each sample.
+    """Microseconds of cuts such as `33+67`, in milliseconds; each `any` is a draw, -1, -2 and so on.
 
     Raises:
         InputError: it is something else.
     """
-    if text.strip() == _ANY:
-        return (DRAWN,)
     parts = [part.strip() for part in re.split(r"[+,]", text)] if text.strip() else []
+    draws = tuple(range(-1, -1 - parts.count(_ANY), -1))
     try:
-        cuts = tuple(sorted({round(1000 * float(part)) for part in parts}))
+        cuts = tuple(sorted({round(1000 * float(part)) for part in parts if part != _ANY}))
     except (ValueError, OverflowError):
         cuts = (0,)
-    if len(cuts) > _MOST_CUTS or not all(1000 <= cut < 10**9 for cut in cuts):
+    if len(draws + cuts) > _MOST_CUTS or not all(1000 <= cut < 10**9 for cut in cuts):
         raise InputError(
             f"cuts {text!r} are not understood; give up to {_MOST_CUTS} times of a millisecond or more, "
             "such as 33+67, or any"
         )
-    return cuts
+    return draws + cuts
 
 
 def variants_of(*, mirror: bool = False, cuts: Sequence[int] = (), shift: int = 0) -> tuple[Variant, ...]:

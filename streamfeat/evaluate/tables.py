@@ -269,7 +269,7 @@ def notes(result: dict[str, Any]) -> list[str]:
     setting = base_rows(result)[0]["setting"]
     more = ["mirror images"] if setting["mirror"] else []
     if cuts := setting["cuts"].strip():
-        more += [f"beginnings of {'any length' if cuts == 'any' else f'{cuts} ms'}"]
+        more += [f"beginnings of {cuts} ms"]
     more += [f"copies moved by {setting['shift']} pixels"] if setting["shift"] else []
     if more:
         lines.append(f"Trained, for every method, on {', '.join(more)} of the training samples as well.")
