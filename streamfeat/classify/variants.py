@@ -70,7 +70,8 @@ class Variant:
         """
         text = f"{label.source} {label.start_us} {self.mirror} {self.cut_us}"
         draw = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
-        return max(1, round(label.duration_us * _LEAST_SHARE ** (draw / 2**32)))
+        share: float = _LEAST_SHARE ** (draw / 2**32)
+        return max(1, round(label.duration_us * share))
 
     def __str__(self) -> str:
         """What it is, in words."""

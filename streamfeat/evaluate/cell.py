@@ -181,11 +181,10 @@ def _trained(
 ) -> tuple[Classifier | KernelClassifier, float]:
     """The classifier of a cell, and the seconds that it took."""
     started = time.perf_counter()
-    report("training", 0, 0, f"{_INNER_FOLDS}-fold cross-validation")
     rows, labels, numbers = training_set(samples, others)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
-    classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True)
+    classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True, report=report)
     seconds = time.perf_counter() - started
     report("training", 1, 1, "")
     return classifier, seconds
