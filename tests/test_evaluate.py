@@ -727,6 +727,7 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     assert base[0]["learned"]["kurtosis"] > 1
     assert 0 < base[0]["learned"]["used"] < 1
     html = page.read_text()
+    assert "training was on whole samples (--cuts any decides earlier)" in html
     for title in ("Accuracy", "Sweeps", "Early decision", "Online", "Confusion", "Convergence", "Filters"):
         assert f"<h2>{title}" in html
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', html)  # nothing from elsewhere

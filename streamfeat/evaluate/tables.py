@@ -296,10 +296,11 @@ def notes(result: dict[str, Any]) -> list[str]:
         )
     early = next((row["early"] for row in result["rows"] if "early" in row), None)
     if early:
+        whole = "" if setting["cuts"] else ", and training was on whole samples (--cuts any decides earlier)"
         lines.append(
             f"Early decision: {early['samples']:,} held-out samples, cut off after some time or some events; "
-            "the window ends at the cut. Times are the first measured points from which on the accuracy "
-            "stays above the share."
+            f"the window ends at the cut{whole}. Times are the first measured points from which on the "
+            "accuracy stays above the share."
         )
     online = next((row["prequential"] for row in result["rows"] if "prequential" in row), None)
     if online:
