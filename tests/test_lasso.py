@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import naive
 import numpy as np
 import pytest
 from kernel_table import assert_certified, lasso_scratch, with_response
@@ -18,7 +19,11 @@ def solve(atoms, x, penalty, gap=GAP, start=None):
     gram = (atoms @ atoms.T).astype(np.float32)
     kept = with_response(gram, np.zeros(len(atoms)) if start is None else start)
     work, chosen, corners = lasso_scratch(len(atoms))
-    reached = solve_lasso(atoms @ x, float(x @ x), penalty, gram, gap, kept, work[1:], chosen, corners)
+    right, square = atoms @ x, float(x @ x)
+    reached = solve_lasso(right, square, penalty, gram, gap, kept, work[1:], chosen, corners)
+    residual = right - gram.astype(np.float64) @ kept[CODE]
+    own = naive.duality_gap(residual, right, kept[CODE], square, penalty) / max(square / 2, 1e-300)
+    assert own == pytest.approx(reached, abs=1e-9)  # that of all atoms, not of the working set alone
     return reached, kept
 
 
@@ -67,7 +72,7 @@ def test_weights_that_creep_between_dependent_atoms_arrive():
     geometry = Geometry(patch=(1, 3), stride=1, n_bins=2, bin_us=1)
     encoder = random_encoder(np.random.default_rng(285), geometry, 31, "inverse", "split", threshold=0.02)
     engine = Engine(encoder, (1, 3), origin_us=0)
-    engine.feed(make_events([0], [1], [0], [0]))
+    engine.feed(make_events([1], [0], [0], [0]))
     engine.features()
     assert_certified(engine._operator, engine._state)
 
