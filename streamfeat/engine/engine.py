@@ -305,6 +305,12 @@ class Engine(Shown):
         return int(self._window.tally[TALLY_EVENTS])
 
     @property
+    def active_volumes(self) -> int:
+        """Volumes of all scales that were not empty when features were last read, as in `stats()`."""
+        squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
+        return int(np.count_nonzero(squares)) + sum(scale.active_volumes for _, scale in self._further)
+
+    @property
     def _encoded(self) -> int:
         """Volumes of the first scale encoded so far."""
         return int(self._state.encoded.sum()) + (self._past.encoded if self._past else 0)
@@ -312,12 +318,8 @@ class Engine(Shown):
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
         events, late, rejected, saturated, rolls = (int(value) for value in self._window.tally)
-        encoded = self._encoded
-        plane = self._state.clock[CLOCK_PLANE]
-        active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
-        for seen in [scale.stats() for _, scale in self._further]:
-            active, encoded = active + seen.active_volumes, encoded + seen.encoded_volumes
-        return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
+        encoded = self._encoded + sum(scale.stats().encoded_volumes for _, scale in self._further)
+        return EngineStats(events, late, rejected, saturated, rolls, self.active_volumes, encoded)
 
     @one_thread
     def restart(self, origin_us: int) -> None:

@@ -211,8 +211,9 @@ def inverse(bench: Bench) -> Iterator[Row]:
     fields = {name: getattr(encoder, name) for name in ("filters", "whitening", "mean", "threshold")}
     np.savez(arrays, **fields, eps=encoder.operator.eps, gap=GAP)
     usual = sf.Geometry()  # only what differs from it: the version before has fewer fields
-    names = [name for name in geometry.__dataclass_fields__ if getattr(geometry, name) != getattr(usual, name)]
-    model = bench.model("inverse", geometry={name: getattr(geometry, name) for name in names}, arrays=arrays)
+    shape = {name: getattr(geometry, name) for name in geometry.__dataclass_fields__}
+    shape = {name: value for name, value in shape.items() if value != getattr(usual, name)}
+    model = bench.model("inverse", geometry=shape, arrays=arrays)
     task = _burst(bench, "inverse", setting.material.burst(geometry, 60)) | {"model": model, "repeats": 3}
     found = compared(bench.trees, bench.rounds, {"before": task, "now": task})
     yield _ratio("inverse, K = 1700, lambda0 = 1", 1.5, found, "", f"; {_micro(found)}")
