@@ -220,6 +220,8 @@ def simulated_image(path: Path, source: str, scene: Scene) -> tuple[Events, Reso
                 f"{path}: is {columns}x{rows} pixels on the sensor, too narrow to move by {margin}; "
                 "--border black shows all of it"
             )
+        if np.ptp(picture) == 0:
+            raise InputError(f"{path}: is all of one grey; nothing changes where it moves")
     amplitude = scene.amplitude_px, scene.amplitude_px
     saccades = Saccades(image_px=max(rows, columns), amplitude_px=amplitude)
     rng = np.random.default_rng([scene.seed, zlib.crc32(source.encode())])
