@@ -558,6 +558,12 @@ LASSO = {
         "an atom changes its sign": lambda call: (call.atoms * _descended(call) < 0).any(),
         "an atom stays at zero": lambda call: ((call.atoms == 0) & (_descended(call) == 0)).any(),
     },
+    "extrapolate": {
+        "uphill": lambda call: call.before.any() and (_extrapolated(call) == call.atoms).all(),
+        "to the least objective": lambda call: (_extrapolated(call) != call.atoms).any(),
+        "an atom is used up": lambda call: ((call.atoms != 0) & (_extrapolated(call) == 0)).any(),
+        "without an end": lambda call: not call.corner.any() and (_extrapolated(call) == call.atoms).all(),
+    },
     "add_rows": {
         "no row": lambda call: len(call.moved) == 0,
         "fewer than four": lambda call: 0 < len(call.moved) < 4,
@@ -596,6 +602,12 @@ LASSO = {
 def _descended(call):
     atoms = call.atoms.copy()
     naive.descend(call.penalty, call.corner, atoms, call.residual.copy())
+    return atoms
+
+
+def _extrapolated(call):
+    atoms = call.atoms.copy()
+    naive.extrapolate(call.penalty, call.corner, call.before.copy(), atoms, call.residual.copy())
     return atoms
 
 

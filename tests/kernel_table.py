@@ -832,6 +832,15 @@ def make_descend(rng):
     return 0.1, corner, atoms, residual
 
 
+def make_extrapolate(rng):
+    penalty, corner, atoms, residual = make_descend(rng)
+    if rng.random() < 0.2:  # nothing bends the objective
+        residual[: len(corner)] += corner[:, : len(corner)] @ atoms
+        corner[:] = 0
+    direction = float(pick(rng, [1.0, 0.01])) * rng.normal(size=len(atoms))
+    return penalty, corner, atoms - direction * (rng.random(len(atoms)) < 0.7), atoms, residual
+
+
 def make_add_rows(rng):
     gram, n = rng.normal(size=(12, 33)).astype(np.float32), int(rng.integers(0, 12))
     return rng.normal(size=n), rng.permutation(12)[:n], frozen(gram), rng.normal(size=33)
@@ -1704,6 +1713,7 @@ KERNELS = [
     Row(lasso.solve_lasso, make_solve_lasso, lasso_within_gap),
     Row(lasso.subtract_row, make_subtract_row),
     Row(lasso.descend, make_descend, close_but_scratch),
+    Row(lasso.extrapolate, make_extrapolate, close_but_scratch),
     Row(lasso.select_atoms, make_select_atoms, selected),
     Row(lasso.copy_corner, make_copy_corner),
     Row(lasso.add_rows, make_add_rows, close_but_scratch),

@@ -521,6 +521,27 @@ def descend(penalty, corner, atoms, residual):
     residual[:n] = right - gram @ atoms
 
 
+def extrapolate(penalty, corner, before, atoms, residual):
+    n = len(atoms)
+    gram = corner[:, :n].astype(np.float64)
+    direction = atoms - before
+    before[:] = direction
+    growth = np.where(atoms == 0, np.abs(direction), np.sign(atoms) * direction).sum()
+    slope = direction @ residual[:n] - penalty * growth
+    if slope <= 0:
+        return
+    ends = np.full(n + 1, np.inf)
+    shrinking = np.flatnonzero(atoms * direction < 0)
+    ends[shrinking] = -atoms[shrinking] / direction[shrinking]
+    curvature = direction @ gram @ direction
+    ends[n] = slope / curvature if curvature > 0 else np.inf
+    if np.isfinite(ends.min()):
+        atoms += ends.min() * direction
+        residual[:n] -= ends.min() * gram @ direction
+        if ends.argmin() < n:
+            atoms[ends.argmin()] = 0
+
+
 def lasso_code(projection, sigma, square, operator, kept, work, chosen, corners):
     k = kept.shape[1]
     right = projection[:k] * (operator.scale / sigma) - operator.offset[:k] / operator.unit

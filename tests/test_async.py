@@ -32,6 +32,17 @@ def young_garbage():
     gc.freeze()
 
 
+OTHERS = set()
+"""Threads that were there before a test: of an engine that a failure elsewhere keeps for its report, say."""
+
+
+@pytest.fixture(autouse=True)
+def threads_of_others():
+    OTHERS.update(threading.enumerate())
+    yield
+    OTHERS.clear()
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("async")
@@ -73,7 +84,7 @@ async def collected(stream):
 def left_over():
     """Threads of ours, and files that are open."""
     gc.collect()
-    threads = [t.name for t in threading.enumerate() if t.name.startswith("streamfeat")]
+    threads = [t.name for t in threading.enumerate() if t.name.startswith("streamfeat") and t not in OTHERS]
     opened = []
     for descriptor in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
