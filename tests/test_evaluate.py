@@ -358,6 +358,15 @@ def test_a_later_layer_sees_the_answers_of_the_one_before():
     assert hots.encode(events, (4, 12)).reshape(4, 3)[:, :].sum(axis=0).tolist() == [3, 1, 1]
 
 
+def test_chunks_of_events_change_nothing_in_hots(monkeypatch):
+    hots = BASELINES[2]
+    events = tiny.steady(0, 50_000, 900)
+    whole = hots.encode(events, tiny.RESOLUTION)
+    monkeypatch.setattr("streamfeat.evaluate.surfaces._CHUNK", 64)
+    np.testing.assert_array_equal(hots.encode(events, tiny.RESOLUTION), whole)
+    assert np.count_nonzero(whole) > 4
+
+
 def test_hots_draws_from_three_layers_and_wants_events(digits, tmp_path):
     with open_recording(digits) as recording:
         hots = SurfaceHistogram.fitted([recording], 200)

@@ -104,6 +104,23 @@ def test_the_border_of_an_image_is_never_seen_or_is_black_all_around(tmp_path):
     assert "white.png: is all of one grey" in done.failed[0][1]
 
 
+def test_around_an_image_all_may_be_as_its_border(tmp_path):
+    dark = np.full((28, 28), 255, np.uint8)
+    dark[10:18, 10:18] = 0
+    save(tmp_path / "set" / "a" / "dark.png", dark)
+    save(tmp_path / "set" / "a" / "white.png", np.full((28, 28), 255, np.uint8))
+    edge = Scene(replace(SCENE.camera, resolution=(34, 34)), amplitude_px=3.0, border="edge")
+    done, samples = simulate_to(tmp_path / "edge.mcap", tmp_path / "set", edge)
+    assert "white.png: is all of one grey" in done.failed[0][1]
+    (sample,) = samples.values()
+    events = sample.events
+    assert sample.resolution == (34, 34)
+    assert 7 < events["x"].min() < events["x"].max() < 26
+    # It goes down first: the lower side darkens where the upper one brightens.
+    first = events[events["t"] - events["t"].min() < 90_000]
+    assert first["y"][first["p"] == 0].mean() > first["y"][first["p"] == 1].mean() + 3
+
+
 def test_transparent_is_black_and_16_bits_are_16_bits(tmp_path):
     plain = blocks()
     eight = load_picture(save(tmp_path / "8.png", plain), (40, 50))

@@ -108,21 +108,31 @@ def pair_table(real: Samples, simulated: Samples) -> str:
         lines.append(f"| {figure} | {np.median(a):,g} | {np.median(b):,g} | {low:.2f} to {high:.2f} |")
     rates = [np.mean([rate(samples[name][0]) for name in names], axis=0) for samples in (real, simulated)]
     lines += ["", f"correlation of the two mean rates over time: {np.corrcoef(*rates)[0, 1]:.3f}"]
-    alike = likeness([real[name] for name in names], [simulated[name] for name in names])
+    sides = [[samples[name] for name in names] for samples in (real, simulated)]
+    signed = [np.median(np.diag(likeness(*sides, saccade))) for saccade in range(3)]
+    alike = likeness(*sides)
     own = float((alike.argmax(axis=1) == np.arange(len(names))).mean())
     lines.append(f"correlation of the counts of pixels, median of pairs: {np.median(np.diag(alike)):.3f}")
+    words = ", ".join(f"{one:.3f}" for one in signed)
+    lines.append(f"the same of ON less OFF, in each saccade: {words} (below 0: polarities are turned around)")
     return "\n".join([*lines, f"recordings nearest to their own image's simulation: {own:.3f}"])
 
 
 def likeness(
-    real: Sequence[tuple[Events, Resolution]], simulated: Sequence[tuple[Events, Resolution]]
+    real: Sequence[tuple[Events, Resolution]],
+    simulated: Sequence[tuple[Events, Resolution]],
+    saccade: int | None = None,
 ) -> NDArray[np.float64]:
-    """Correlation `(n, m)` of the counts of pixels, both polarities alike."""
+    """Correlation `(n, m)` of the counts of pixels, both polarities alike; or of ON less OFF in a saccade."""
     height, width = np.max([size for _, size in [*real, *simulated]], axis=0)
 
     def standard(samples: Sequence[tuple[Events, Resolution]]) -> NDArray[np.float64]:
-        places = (e["y"].astype(np.int64) * width + e["x"] for e, _ in samples)
-        counts = np.array([np.bincount(place, minlength=height * width) for place in places], np.float64)
+        counts = np.zeros((len(samples), height * width))
+        for row, (events, _) in zip(counts, samples, strict=True):
+            place, sign = events["y"].astype(np.int64) * width + events["x"], np.ones(len(events))
+            if saccade is not None:
+                sign = (events["t"] // SACCADE_US == saccade) * (2.0 * events["p"] - 1)
+            row += np.bincount(place, sign, height * width)
         counts -= counts.mean(axis=1, keepdims=True)
         return counts / np.maximum(np.linalg.norm(counts, axis=1, keepdims=True), 1e-12)
 

@@ -13,7 +13,8 @@ writes
     pairs/images_others                            of each digit the 320 images after those recorded
 
 The package has the images of each digit in the order of the set, and N-MNIST numbers its samples from 1 in
-that order: the k-th 7 of one is the k-th 7 of the other, as long as no sample before it is missing.
+that order: the k-th 7 of one is the k-th 7 of the other, as long as no sample before it is missing. Digits
+are written dark on white: in MNIST 0 is the paper, and the polarities of N-MNIST are those of such a screen.
 """
 
 import argparse
@@ -30,9 +31,9 @@ SIDE = 28
 
 
 def images_of(digits: Path, digit: int) -> NDArray[np.uint8]:
-    """Images `(n, 28, 28)` uint8 of a digit, in the order of the training set."""
+    """Images `(n, 28, 28)` uint8 of a digit, dark on white, in the order of the training set."""
     values = np.array(json.loads((digits / f"{digit}.json").read_bytes())["data"])
-    return np.rint(255 * values.reshape(-1, SIDE, SIDE)).astype(np.uint8)
+    return np.rint(255 - 255 * values.reshape(-1, SIDE, SIDE)).astype(np.uint8)
 
 
 def recorded_of(samples: Path) -> list[list[Path]]:

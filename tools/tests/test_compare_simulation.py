@@ -42,6 +42,16 @@ def test_likeness_is_the_correlation_of_counts():
     assert found[1, 2] == pytest.approx(np.corrcoef(*counts)[0, 1])
 
 
+def test_where_polarities_are_turned_around_it_is_told():
+    events, size = sample(0)
+    turned = events.copy()
+    turned["p"] = 1 - turned["p"]
+    assert likeness([(events, size)], [(turned, size)])[0, 0] == pytest.approx(1)
+    assert [likeness([(events, size)], [(turned, size)], i)[0, 0] for i in range(3)] == pytest.approx(
+        [-1] * 3
+    )
+
+
 def test_recordings_without_a_common_name_are_refused():
     with pytest.raises(InputError, match="no sample"):
         pair_table({"a": sample(0)}, {"b": sample(0)})

@@ -29,9 +29,9 @@ def test_each_recording_of_the_earlier_half_has_its_image(data, tmp_path):
     assert counted == {"recorded_first": 20, "recorded_second": 20, "images_first": 20, "images_others": 20}
     assert (out / "recorded_first/7/00018.bin").read_bytes() == bytes([7, 1])
     assert (out / "recorded_second/7/00028.bin").read_bytes() == bytes([7, 2])
-    assert np.asarray(Image.open(out / "images_first/7/00018.png")).tolist() == [[71] * SIDE] * SIDE
+    assert np.asarray(Image.open(out / "images_first/7/00018.png")).tolist() == [[255 - 71] * SIDE] * SIDE
     others = sorted((out / "images_others/7").iterdir())
-    assert [int(np.asarray(Image.open(path))[0, 0]) for path in others] == [74, 75]
+    assert sorted(int(np.asarray(Image.open(path))[0, 0]) for path in others) == [255 - 75, 255 - 74]
 
 
 def test_where_a_number_is_missing_ranks_say_nothing(data):
