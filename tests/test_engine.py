@@ -502,6 +502,31 @@ def test_nothing_is_left_to_prepare_for_an_engine_that_does_not_look_ahead():
     assert not case.engine(look_ahead=True).prepare(0)
 
 
+@pytest.mark.parametrize("kind", EXACT_KINDS)
+def test_idle_time_is_used_for_a_short_update(kind, monkeypatch):
+    case = known_case(kind)
+    engine, busy, large = case.engine(), case.engine(), case.engine()
+    for one in (engine, busy, large):
+        one.feed(some_events(case))
+    assert engine.prepare(0)
+    encoded = engine.stats().encoded_volumes
+    assert encoded > 0
+    np.testing.assert_array_equal(engine.features(), busy.features(), strict=True)
+    assert engine.stats().encoded_volumes == encoded
+    monkeypatch.setattr("streamfeat.engine.update.LITTLE", 0)
+    assert large.prepare(0)
+    assert large.stats().encoded_volumes == 0
+
+
+@pytest.mark.parametrize("kind", LASSO_KINDS)
+def test_idle_time_changes_no_code_of_a_lasso(kind):
+    case = known_case(kind)
+    engine = case.engine()
+    engine.feed(some_events(case))
+    assert engine.prepare(10**6)
+    assert engine.stats().encoded_volumes == 0
+
+
 # Memory
 
 

@@ -21,7 +21,7 @@ from streamfeat.engine.snapshot import Snapshot, check_further, check_snapshot, 
 from streamfeat.engine.state import allocate_state, clear_state, enter_counts
 from streamfeat.engine.threads import Crew, one_thread
 from streamfeat.engine.trace import Trace, joined, trace_events
-from streamfeat.engine.update import is_complete, is_worth_sharing, update_plane
+from streamfeat.engine.update import is_complete, is_little, is_worth_sharing, update_plane
 from streamfeat.events import Events, Resolution, as_events
 from streamfeat.kernels.encode import encode_volume
 from streamfeat.kernels.follow import follow
@@ -189,28 +189,31 @@ class Engine(Shown):
 
     def _turn_to(self, new: int) -> None:
         """Make a bin the current one, if it is later; all events of the bins before are in."""
-        state = self._state
-        if new <= state.clock[CLOCK_NOW]:
+        if new <= self._state.clock[CLOCK_NOW]:
             return
         if self._past:
-            if is_complete(self._operator, state):
-                update_plane(self._operator, state, self._crew)
-                self._past.keep(state)
+            if is_complete(self._operator, self._state):
+                update_plane(self._operator, self._state, self._crew)
+                self._past.keep(self._state)
             self._past.advance(new)
-        advance_to_bin(new, self._operator, state)
+        advance_to_bin(new, self._operator, self._state)
 
     @one_thread
     def prepare(self, columns: int) -> bool:
-        """Use idle time to look ahead to the next bin boundary.
+        """Use idle time to look ahead to the next bin boundary; without `look_ahead`, for a short update.
+
+        Not with the inverse formulation, whose codes depend on when they are solved, within their gap.
 
         Args:
-            columns: operator columns that may be added, a bound of the work, for each scale.
+            columns: operator columns that may be added to look ahead, a bound of the work, for each scale.
 
         Returns:
             whether nothing is left to prepare.
         """
         if len(self._state.cursors) == 1:  # there is no plane that could look ahead
-            return True
+            if not self._operator.inverse and is_little(self._operator, self._state):
+                self._update()
+            return all(scale.prepare(columns) for _, scale in self._further)
         self._update()
         volumes = self.grid_shape[0] * self.grid_shape[1]
         left = look_ahead(volumes, volumes, columns, self._operator, self._state)
@@ -257,9 +260,7 @@ class Engine(Shown):
 
     @one_thread
     def codes(self) -> NDArray[np.float32]:
-        """The code of every local volume of the first scale that ends with the current bin, a copy:
-        `(rows, columns, K)` float32, before any split.
-        """
+        """Codes of the first scale's volumes that end now, `(rows, columns, K)` float32, before any split."""
         self._update()
         state, operator = self._state, self._operator
         plane = state.clock[CLOCK_PLANE]
@@ -285,8 +286,9 @@ class Engine(Shown):
 
     @one_thread
     def activity(self) -> NDArray[np.int64]:
-        """The sum of squared entries of every local volume of the first scale that ends with the current bin,
-        a copy: `(rows, columns)` int64; 0 is empty.
+        """The sum of squared entries of each local volume of the first scale that ends with the current bin.
+
+        A copy, `(rows, columns)` int64; 0 is empty.
         """
         self._update()
         squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
@@ -305,6 +307,12 @@ class Engine(Shown):
         return int(self._window.tally[TALLY_EVENTS])
 
     @property
+    def active_volumes(self) -> int:
+        """Volumes of all scales that were not empty when features were last read, as in `stats()`."""
+        squares = self._state.moments[self._state.clock[CLOCK_PLANE], :, MOMENT_SQUARES]
+        return int(np.count_nonzero(squares)) + sum(scale.active_volumes for _, scale in self._further)
+
+    @property
     def _encoded(self) -> int:
         """Volumes of the first scale encoded so far."""
         return int(self._state.encoded.sum()) + (self._past.encoded if self._past else 0)
@@ -312,12 +320,8 @@ class Engine(Shown):
     def stats(self) -> EngineStats:
         """Counts since the engine was made (or since the snapshot that was restored)."""
         events, late, rejected, saturated, rolls = (int(value) for value in self._window.tally)
-        encoded = self._encoded
-        plane = self._state.clock[CLOCK_PLANE]
-        active = int(np.count_nonzero(self._state.moments[plane, :, MOMENT_SQUARES]))
-        for seen in [scale.stats() for _, scale in self._further]:
-            active, encoded = active + seen.active_volumes, encoded + seen.encoded_volumes
-        return EngineStats(events, late, rejected, saturated, rolls, active, encoded)
+        encoded = self._encoded + sum(scale.stats().encoded_volumes for _, scale in self._further)
+        return EngineStats(events, late, rejected, saturated, rolls, self.active_volumes, encoded)
 
     @one_thread
     def restart(self, origin_us: int) -> None:

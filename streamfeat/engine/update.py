@@ -16,7 +16,11 @@ from streamfeat.kernels.layout import (
 from streamfeat.kernels.planes import complete, finish, list_missing
 from streamfeat.kernels.update import mark_dirty, renew, settle
 
-__all__ = ["is_complete", "is_worth_sharing", "update_plane"]
+__all__ = ["is_complete", "is_little", "is_worth_sharing", "update_plane"]
+
+LITTLE = 1 << 21
+"""Filters times volumes of an update that idle time is used for: at most a millisecond and a half, which a
+packet that comes meanwhile has to wait."""
 
 
 def update_plane(operator: Operator, state: State, crew: Crew) -> None:
@@ -41,9 +45,19 @@ def is_complete(operator: Operator, state: State) -> bool:
 
 
 def is_worth_sharing(operator: Operator, state: State, crew: Crew) -> bool:
-    """Whether there may be enough to do for several threads, by a bound of the volumes to work on."""
+    """Whether there may be enough to do for several threads."""
+    return crew.is_worth_counting(_most_work(operator, state))
+
+
+def is_little(operator: Operator, state: State) -> bool:
+    """Whether an update is certain to be short."""
+    return _most_work(operator, state) <= LITTLE
+
+
+def _most_work(operator: Operator, state: State) -> int:
+    """Filters times a bound of the volumes to work on."""
     volumes = operator.shape[0] * operator.shape[1]
     if is_complete(operator, state):
         rows, columns = (-(-side // operator.stride) for side in operator.patch)
         volumes = len(state.cursors) * min(volumes, int(state.clock[CLOCK_TOUCHED]) * rows * columns)
-    return crew.is_worth_counting(volumes * operator.offset.shape[0])
+    return int(volumes * operator.offset.shape[0])

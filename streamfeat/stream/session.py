@@ -312,7 +312,7 @@ class Session(Emitter):
 
     def _active_volumes(self) -> int | None:
         """Counting them is nothing beside an emission, but much beside one event."""
-        return self._engine.stats().active_volumes if self._engine and not self._every_event else None
+        return self._engine.active_volumes if self._engine and not self._every_event else None
 
     def _feed_at_once(
         self, engine: Engine, events: Events, latest: NDArray[np.int64]

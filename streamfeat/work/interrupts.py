@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from threading import Event, Thread, current_thread, main_thread
 from types import FrameType
 from typing import Any, NoReturn, TypeVar
@@ -64,18 +65,14 @@ _QUIT = 0
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
+@dataclass(slots=True)
 class _Phase:
-    """What an interrupt does now."""
+    """What an interrupt does now: call a function, wait, end the process, or else be raised."""
 
-    def __init__(
-        self,
-        action: Callable[[], None] | None = None,
-        *,
-        is_promised: bool = False,
-        waits: bool = False,
-        ends: bool = False,
-    ) -> None:
-        self.action, self.is_promised, self.waits, self.ends = action, is_promised, waits, ends
+    action: Callable[[], None] | None = None
+    is_promised: bool = False
+    waits: bool = False
+    ends: bool = False
 
 
 class _Interrupts:

@@ -151,8 +151,8 @@ def _own_bytes(value: Any, seen: set[int]) -> int:
         return 0
     seen.add(id(value))
     if isinstance(value, np.ndarray):
-        if isinstance(value.base, np.ndarray):  # aligned within a larger one, which nothing else holds
-            return _own_bytes(value.base, seen)
+        if value.flags.writeable and isinstance(value.base, np.ndarray):
+            return _own_bytes(value.base, seen)  # aligned within a larger one, which nothing else holds
         return value.nbytes if value.flags.writeable else 0
     if isinstance(value, tuple | list):
         return sum(_own_bytes(item, seen) for item in value)

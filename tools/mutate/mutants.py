@@ -52,6 +52,20 @@ MUTANTS = [
         MARKED,
     ),
     Mutant(
+        "idle time solves a lasso",
+        "engine/engine.py",
+        "if not self._operator.inverse and is_little(self._operator, self._state):",
+        "if is_little(self._operator, self._state):",
+        "tests/test_engine.py -k idle_time",
+    ),
+    Mutant(
+        "idle time is not used",
+        "engine/engine.py",
+        "if not self._operator.inverse and is_little(self._operator, self._state):",
+        "if False:",
+        "tests/test_engine.py -k idle_time",
+    ),
+    Mutant(
         "a descent that creeps goes on creeping",
         "kernels/lasso.py",
         "            extrapolate(penalty, corner, steps, some, rest)\n",
