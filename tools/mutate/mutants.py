@@ -314,7 +314,7 @@ MUTANTS = [
     Mutant(
         "a bin is kept that was not brought up to date",
         "engine/engine.py",
-        "                update_plane(self._operator, state, self._crew)\n                self._past",
+        "                update_plane(self._operator, self._state, self._crew)\n                self._past",
         "                self._past",
         SHORT,
     ),
