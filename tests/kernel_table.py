@@ -1582,9 +1582,11 @@ def make_add_memory_surfaces(rng):
 
 def make_time_surfaces(rng):
     height, width, side = int(rng.integers(1, 9)), int(rng.integers(1, 9)), 2 * int(rng.integers(0, 4)) + 1
-    events = _surface_events(rng, height, width, random_length(rng, 60))
-    latest = np.full((2, height + side - 1, width + side - 1), -np.inf)
-    return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
+    x, y, p, t = _surface_events(rng, height, width, random_length(rng, 60))
+    n_polarities = int(rng.choice([2, 2, 5]))  # of a camera, or of a layer of HOTS
+    p = p if n_polarities == 2 else rng.integers(0, n_polarities, len(p))
+    latest = np.full((n_polarities, height + side - 1, width + side - 1), -np.inf)
+    return x, y, p, t, latest, np.empty((len(x), n_polarities, side, side), np.float32)
 
 
 def make_describe_events(rng):
