@@ -14,6 +14,8 @@ from streamfeat.classify.classifier import Classifier
 from streamfeat.classify.kernel import train_kernel_classifier
 from streamfeat.classify.variants import Variant
 from streamfeat.errors import InputError
+from streamfeat.evaluate import cell as cell_module
+from streamfeat.evaluate import feature_files
 from streamfeat.evaluate.scores import predict_all
 from streamfeat.recordings.reader import Label
 
@@ -117,6 +119,42 @@ def test_a_sweep_of_mirror_images_at_test_shares_features(run, home):
     assert trained["hits"] == rows["mirror", False]["hits"]
 
 
+def test_a_classifier_serves_all_cells_that_differ_in_what_is_scored(run, home, monkeypatch):
+    fitted = []
+    train = cell_module.train
+
+    def counted(*arguments, **options):
+        fitted.append(len(arguments[1]))
+        return train(*arguments, **options)
+
+    monkeypatch.setattr(cell_module, "train", counted)
+    rows = evaluated(run, home, "--sweep", "test-mirror=yes,no", "--sweep", "mirror=yes").json["rows"]
+    assert sorted(fitted) == 3 * [40] + 3 * [80]
+    assert len({row["train_s"] for row in rows if not row["setting"]["mirror"]}) == 1
+
+
+# Features that are kept
+
+
+def test_kept_features_are_those_that_would_have_been_encoded(run, home, monkeypatch, tmp_path):
+    options = ["--test-mirror", "--features", tmp_path]
+    alone = evaluated(run, home, "--test-mirror").json["rows"][0]
+    assert evaluated(run, home, *options).json["rows"][0]["hits"] == alone["hits"]
+    kept = sorted(tmp_path.iterdir())
+    assert len(kept) == 2  # of the samples and of their mirror images
+    monkeypatch.setattr(feature_files, "encode_recordings", None)
+    assert evaluated(run, home, *options, "--sweep", "mirror=yes").json["rows"][0]["hits"] == alone["hits"]
+    # Of other samples, or with another model, nothing fits.
+    MODEL.save(tmp_path / "again.model")
+    assert evaluated(run, home, "-m", tmp_path / "again.model", *options).status == 0
+    tiny.encoder(k=3).save(tmp_path / "other.model")
+    with pytest.raises(TypeError):
+        evaluated(run, home, "-m", tmp_path / "other.model", *options)
+    kept[0].write_bytes(kept[1].read_bytes())
+    refused = evaluated(run, home, *options)
+    assert (refused.status, "does not hold the features" in " ".join(refused.err.split())) == (2, True)
+
+
 # Calibration over folds
 
 
@@ -212,8 +250,10 @@ def test_principal_axes_by_iteration_hold_what_the_exact_ones_hold(monkeypatch):
     monkeypatch.setattr(machine_module, "_DIMENSIONS", 20)
     exact = machine_module._principal_axes(rows)
     monkeypatch.setattr(machine_module, "_EXACT_AXES", 100)
-    near = machine_module._principal_axes(rows)
-    assert near.shape == exact.shape == (290, 20)
-    np.testing.assert_allclose(near.T @ near, np.eye(20), atol=1e-5)
-    assert np.square(rows @ near).sum() > 0.999 * np.square(rows @ exact).sum()
-    assert machine_module._principal_axes(rows).tobytes() == near.tobytes()
+    for wide in (290, 289):  # by the covariance, and by the rows
+        monkeypatch.setattr(machine_module, "_WIDE", wide)
+        near = machine_module._principal_axes(rows)
+        assert near.shape == exact.shape == (290, 20)
+        np.testing.assert_allclose(near.T @ near, np.eye(20), atol=1e-5)
+        assert np.square(rows @ near).sum() > 0.999 * np.square(rows @ exact).sum()
+        assert machine_module._principal_axes(rows).tobytes() == near.tobytes()

@@ -513,7 +513,7 @@ def some_samples(n=6):
 def test_early_decisions_see_what_an_engine_has_seen():
     model = tiny.encoder()
     classifier, samples = tiny.classifier(model), some_samples()
-    early = scores.early_decision(model, classifier, samples)
+    early = scores.early_decision(model, classifier, samples, 100_000)
 
     def accuracy(cut):
         return np.mean([cut(s) == s.label.label for s in samples])
@@ -542,6 +542,12 @@ def test_early_decisions_see_what_an_engine_has_seen():
         assert point["accuracy"] == accuracy(in_number)
     assert [point["events"] for point in early["events"]] == [50, 100, 200, 210]
     assert early["time"][-1] == {"ms": 100, "accuracy": early["events"][-1]["accuracy"]}
+    # Of folds together it is as if they had been one.
+    parts = [
+        {"samples": len(some), **scores.early_decision(model, classifier, some, 100_000)}
+        for some in (samples[:4], samples[4:])
+    ]
+    assert scores.joined_decisions(parts) == {"samples": len(samples), **early}
 
 
 def test_prequential_accuracy_predicts_before_it_learns():
@@ -760,6 +766,7 @@ def test_all_methods_in_tables_json_and_page(animals, tmp_path):
     assert base[0]["learned"]["kurtosis"] > 1
     assert 0 < base[0]["learned"]["used"] < 1
     html = page.read_text()
+    assert "training was on whole samples (--cuts any decides earlier)" in html
     for title in ("Accuracy", "Sweeps", "Early decision", "Online", "Confusion", "Convergence", "Filters"):
         assert f"<h2>{title}" in html
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="?http', html)  # nothing from elsewhere

@@ -254,7 +254,14 @@ def test_a_committee_is_saved_and_an_unsound_one_is_refused(tmp_path):
 def test_the_better_classifier_is_taken(monkeypatch):
     features, labels = rings(150)
     parts = np.arange(150) % 3
-    assert isinstance(train("auto", features, labels.tolist(), MODEL, parts), KernelClassifier)
+    said = []
+    found = train("auto", features, labels.tolist(), MODEL, parts, report=lambda *step: said.append(step))
+    assert isinstance(found, KernelClassifier)
+    assert {step for step, *_ in said} == {"training"}
+    linear, kernel = said[:-1], said[-1]
+    assert [done for _, done, _, _ in linear] == list(range(len(linear)))
+    assert linear[0][3].startswith("linear, 3 folds with C = ")
+    assert kernel[1:] == (0, 1, "Gaussian kernel of 150 samples, scale 1")
     assert isinstance(train("linear", features, labels.tolist(), MODEL, parts), Classifier)
     alone = train("rbf", features, labels.tolist(), MODEL, parts, alone=True)
     assert isinstance(alone, KernelClassifier)

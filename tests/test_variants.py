@@ -69,6 +69,24 @@ def test_a_cut_sample_ends_where_its_window_does():
         assert np.array_equal(same.events, whole.events)
 
 
+def test_a_beginning_is_drawn_for_each_sample_from_its_label_alone():
+    begun = Variant(cut_us=-1)
+    samples = [sample(start_us=1000 * i, duration_us=1000) for i in range(300)]
+    lengths = np.array([begun.of(one).label.duration_us for one in samples])
+    assert 100 <= lengths.min() < 110
+    assert 970 < lengths.max() <= 1000
+    assert abs(np.log10(lengths / 1000).mean() + 0.5) < 3 / np.sqrt(12 * 300)  # a logarithm that is uniform
+    np.testing.assert_array_equal(lengths, [begun.of(one).label.duration_us for one in samples])
+    for one, length in zip(samples, lengths, strict=True):
+        cut, whole = begun.of(one).events["t"], one.events["t"]
+        np.testing.assert_array_equal(cut, whole[whole < one.label.start_us + length])
+    for other in (Variant(mirror=True, cut_us=-1), Variant(cut_us=-2)):
+        others = [other.of(one).label.duration_us for one in samples]
+        assert abs(np.corrcoef(lengths, others)[0, 1]) < 0.2
+    for short in (1, 2, 3):
+        assert 1 <= begun.of(sample(duration_us=short)).label.duration_us <= short
+
+
 def test_a_moved_sample_loses_what_leaves_the_sensor():
     whole = sample()
     height, width = whole.resolution
@@ -100,13 +118,23 @@ def test_which_variants_options_ask_for():
 
 @pytest.mark.parametrize(
     ("text", "cuts"),
-    [("", ()), ("33+67", (33_000, 67_000)), ("67, 33.5", (33_500, 67_000)), ("5+5", (5_000,))],
+    [
+        ("", ()),
+        (" any ", (-1,)),
+        ("any+33+any", (-1, -2, 33_000)),
+        ("33+67", (33_000, 67_000)),
+        ("67, 33.5", (33_500, 67_000)),
+        ("5+5", (5_000,)),
+    ],
 )
 def test_cuts_are_milliseconds(text, cuts):
     assert parse_cuts(text) == cuts
 
 
-@pytest.mark.parametrize("text", ["early", "0", "33+", "-3", "nan", "inf", "1e9", "1+2+3+4+5+6+7+8+9"])
+@pytest.mark.parametrize(
+    "text",
+    ["early", "0", "33+", "-3", "nan", "inf", "1e9", "1+2+3+4+5+6+7+8+9", "any+" * 8 + "any", "any time"],
+)
 def test_cuts_that_make_no_sense_are_refused(text):
     with pytest.raises(InputError, match="not understood; give up to 8 times"):
         parse_cuts(text)

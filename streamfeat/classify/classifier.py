@@ -237,6 +237,7 @@ def train_classifier(
     folds: int = 3,
     seed: int = 0,
     provenance: Mapping[str, Any] | None = None,
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
 ) -> Classifier:
     """Train a linear SVM; its regularisation is chosen by cross-validation.
 
@@ -251,6 +252,7 @@ def train_classifier(
         folds: how many, where `parts` is not given.
         seed: of the shuffling.
         provenance: JSON values kept with the classifier; scores are added.
+        report: called with (step, done, of how many, remark); how many values of C it will take is unknown.
 
     Raises:
         InputError: labels are missing, fewer than two classes, or a class with fewer samples than folds.
@@ -275,6 +277,7 @@ def train_classifier(
     held_out: dict[float, NDArray[np.float32]] = {}
 
     def score(c: float) -> float:
+        report("training", len(held_out), 0, f"linear, {len(sides)} folds with C = {c:g}")
         found = held_out[c] = np.empty((len(targets), n_names), np.float32)
         for train, test, fold_scaler, svm in fitted:
             svm.set_params(C=c).fit(fold_scaler.transform(rows[train]), targets[train])

@@ -12,7 +12,7 @@ by side is a product of their kernels: it is large only where a sample is like a
 On the block of N-CARS that is least like the others it was worse than any scale alone, the average better.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -200,6 +200,7 @@ def train_kernel_classifier(
     labels: NDArray[np.str_],
     parts: NDArray[np.int64] | None = None,
     cells: Sequence[Cells] | None = None,
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
 ) -> KernelClassifier:
     """Train the kernel classifier that stands beside a linear one.
 
@@ -217,6 +218,7 @@ def train_kernel_classifier(
         parts: `(n,)` the fold in which each row is scored for the temperature; without, scores are no
             probabilities.
         cells: of each machine, see `machine.cells_of`; one machine of one cell if not given.
+        report: called with (step, done, of how many, remark).
 
     Raises:
         InputError: there are more rows than the kernel matrix may have, or memory for.
@@ -229,7 +231,7 @@ def train_kernel_classifier(
             "fewer samples or variants of them"
         )
     try:
-        return _trained(features, linear, labels, parts, cells or ((features.shape[1],),))
+        return _trained(features, linear, labels, parts, cells or ((features.shape[1],),), report)
     except MemoryError:
         raise InputError(
             f"not enough memory for --kernel rbf with {n:,} training rows, which takes at least "
@@ -243,13 +245,15 @@ def _trained(
     labels: NDArray[np.str_],
     parts: NDArray[np.int64] | None,
     cells: Sequence[Cells],
+    report: Callable[[str, int, int, str], None],
 ) -> KernelClassifier:
     named = labels[:, np.newaxis] == np.array(linear.labels)
     targets = np.where(named, np.float32(1), np.float32(-1))
     some = np.linspace(0, len(labels) - 1, min(len(labels), _FOR_TEMPERATURE)).astype(int)
     held_out = np.zeros((len(some), targets.shape[1]), np.float32)
     machines = []
-    for mine, place in zip(cells, _places(cells), strict=True):
+    for i, (mine, place) in enumerate(zip(cells, _places(cells), strict=True)):
+        report("training", i, len(cells), f"Gaussian kernel of {len(labels):,} samples, scale {i + 1}")
         machines.append(trained_machine(features[:, place], mine, targets))
         if parts is not None:
             held_out += folded_scores(

@@ -4,7 +4,7 @@ Lives here: the choice between the linear classifier and the kernel. Not here: t
 `kernel`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ def train(
     *,
     provenance: Mapping[str, Any] | None = None,
     alone: bool = False,
+    report: Callable[[str, int, int, str], None] = lambda step, done, total, remark: None,
 ) -> Classifier | KernelClassifier:
     """Train a classifier.
 
@@ -52,6 +53,7 @@ def train(
         parts: `(n,)` the fold in which each row is scored.
         provenance: JSON values kept with it.
         alone: with `rbf`, leave the linear classifier beside it untrained: it is not going to be used.
+        report: called with (step, done, of how many, remark).
 
     Raises:
         InputError: see `train_classifier`; or `rbf` is asked for, and rows are too many or memory is short.
@@ -60,11 +62,11 @@ def train(
     if kernel == "rbf" and alone:
         linear = Classifier.untrained(labels, features)
     else:
-        linear = train_classifier(rows, labels, features, parts=parts, provenance=provenance)
+        linear = train_classifier(rows, labels, features, parts=parts, provenance=provenance, report=report)
     if kernel == "linear" or (kernel == "auto" and len(rows) > MOST_POINTS):
         return linear
     try:
-        found = train_kernel_classifier(rows, linear, np.asarray(labels), parts, cells_of(features))
+        found = train_kernel_classifier(rows, linear, np.asarray(labels), parts, cells_of(features), report)
     except InputError:
         if kernel == "auto":  # there is no memory for it
             return linear

@@ -7,6 +7,7 @@ Variants are made of events, not of features, so any geometry will do: a mirrore
 grid that the model has, wherever its volumes lie.
 """
 
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from streamfeat.errors import InputError
-from streamfeat.recordings.reader import Sample
+from streamfeat.recordings.reader import Label, Sample
 
 __all__ = ["PLAIN", "Variant", "parse_cuts", "variants_of"]
 
+_ANY = "any"
+_LEAST_SHARE = 0.1
 _MOST_CUTS = 8
 _MOST_SHIFT = 1024
 
@@ -29,7 +32,8 @@ class Variant:
     Attributes:
         mirror: columns from right to left.
         shift: `(rows, columns)` by which events move; those that leave the sensor are lost.
-        cut_us: the sample is seen for so long only; 0 for all of it.
+        cut_us: the sample is seen for so long only; 0 for all of it. Below zero, for a time that is drawn for
+            each sample; -1, -2 and so on are different draws.
     """
 
     mirror: bool = False
@@ -42,10 +46,11 @@ class Variant:
         An event outside the sensor stays outside. A sample that is no longer than the cut stays whole.
         """
         label, events = sample.label, sample.events
-        if 0 < self.cut_us < label.duration_us:
-            label = replace(label, duration_us=self.cut_us)
+        cut_us = self._drawn(label) if self.cut_us < 0 else self.cut_us
+        if 0 < cut_us < label.duration_us:
+            label = replace(label, duration_us=cut_us)
             t = events["t"]
-            events = events[(t >= label.start_us) & (t < label.start_us + self.cut_us)]
+            events = events[(t >= label.start_us) & (t < label.start_us + cut_us)]
         if self.mirror:
             events = events.copy()
             events["x"] = np.uint16(sample.resolution[1] - 1) - events["x"]  # unsigned: it wraps
@@ -58,11 +63,22 @@ class Variant:
             events["y"], events["x"] = y[inside], x[inside]
         return Sample(label, events, sample.resolution)
 
+    def _drawn(self, label: Label) -> int:
+        """Microseconds from a tenth to all of the sample, by its label and this variant alone.
+
+        The logarithm is uniform: what is new in a further millisecond becomes less and less.
+        """
+        text = f"{label.source} {label.start_us} {self.mirror} {self.cut_us}"
+        draw = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
+        share: float = _LEAST_SHARE ** (draw / 2**32)
+        return max(1, round(label.duration_us * share))
+
     def __str__(self) -> str:
         """What it is, in words."""
         words = ["mirrored"] if self.mirror else []
         words += [f"moved by {self.shift[0]}, {self.shift[1]}"] if self.shift != (0, 0) else []
-        words += [f"first {self.cut_us / 1000:g} ms"] if self.cut_us else []
+        words += [f"first {self.cut_us / 1000:g} ms"] if self.cut_us > 0 else []
+        words += [f"beginning {-self.cut_us}"] if self.cut_us < 0 else []
         return ", ".join(words) or "as it is"
 
 
@@ -71,22 +87,23 @@ PLAIN = Variant()
 
 
 def parse_cuts(text: str) -> tuple[int, ...]:
-    """Microseconds of cuts such as `33+67`, in milliseconds.
+    """Microseconds of cuts such as `33+67`, in milliseconds; each `any` is a draw, -1, -2 and so on.
 
     Raises:
         InputError: it is something else.
     """
     parts = [part.strip() for part in re.split(r"[+,]", text)] if text.strip() else []
+    draws = tuple(range(-1, -1 - parts.count(_ANY), -1))
     try:
-        cuts = tuple(sorted({round(1000 * float(part)) for part in parts}))
+        cuts = tuple(sorted({round(1000 * float(part)) for part in parts if part != _ANY}))
     except (ValueError, OverflowError):
         cuts = (0,)
-    if len(cuts) > _MOST_CUTS or not all(1000 <= cut < 10**9 for cut in cuts):
+    if len(draws + cuts) > _MOST_CUTS or not all(1000 <= cut < 10**9 for cut in cuts):
         raise InputError(
             f"cuts {text!r} are not understood; give up to {_MOST_CUTS} times of a millisecond or more, "
-            "such as 33+67"
+            "such as 33+67, or any"
         )
-    return cuts
+    return draws + cuts
 
 
 def variants_of(*, mirror: bool = False, cuts: Sequence[int] = (), shift: int = 0) -> tuple[Variant, ...]:

@@ -143,6 +143,14 @@ def evaluate(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result to write, as JSON; makes runs resume.")
     ] = None,
+    features: Annotated[
+        Path | None,
+        typer.Option(
+            help="Directory in which features of --method model are kept: runs on the same samples take them "
+            "from there.",
+            show_default="kept nowhere",
+        ),
+    ] = None,
     page: Annotated[Path | None, typer.Option("--report", help="Page to write, .html; extra `plot`.")] = None,
     topic: TopicOption = None,
     cluster: ClusterOption = None,
@@ -226,6 +234,7 @@ def evaluate(
                 workers=place,
                 against=earlier,
                 costs=paper,
+                features=features,
                 finished=lambda row: None if quiet else err.print(_in_short(row), soft_wrap=True),
             )
     except KeyboardInterrupt:

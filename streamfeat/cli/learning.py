@@ -290,12 +290,12 @@ def train(
             report("choosing filters", 1, 1, "")
             samples = encode_recordings(encoder, opened, report, workers=place)
         others = [encode_recordings(encoder, opened, report, variant=v, workers=place) for v in variants]
-        report("training", 0, 0, f"{folds}-fold cross-validation")
         rows, labels, numbers = training_set(samples, others)
         sources = samples.sources[~samples.held_out].tolist()
         parts = assign_folds(labels[: len(sources)], sources, folds, kind)
         made_from = {"variants": [str(v) for v in variants], "groups": kind}
-        found = train_best(kernel, rows, labels, encoder, parts[numbers], provenance=made_from)
+        found = train_best(kernel, rows, labels, encoder, parts[numbers], provenance=made_from, report=report)
+        report("training", 1, 1, "")
     found.save(classifier)
     if selected_model:
         encoder.save(selected_model)

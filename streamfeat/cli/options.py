@@ -177,9 +177,9 @@ Mirror = Annotated[
 Cuts = Annotated[
     str,
     typer.Option(
-        metavar="MS+MS",
-        help="Train the classifier on the beginnings of its samples as well, such as 33+67: so it decides "
-        "early.",
+        metavar="any+any|MS+MS",
+        help="Train the classifier on beginnings of its samples as well, so that it decides early: one of "
+        "each sample, of any length (any), two (any+any), or the first 33 and 67 ms of all (33+67).",
     ),
 ]
 Shift = Annotated[

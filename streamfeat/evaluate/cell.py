@@ -22,6 +22,7 @@ from streamfeat.classify.variants import PLAIN, Variant
 from streamfeat.engine.encoder import Encoder, FeatureMap
 from streamfeat.evaluate.codes import code_statistics
 from streamfeat.evaluate.costs import update_us
+from streamfeat.evaluate.feature_files import FeatureFiles
 from streamfeat.evaluate.methods import Report, make_features
 from streamfeat.evaluate.plan import Cell
 from streamfeat.evaluate.scores import confusion, early_decision, predict_all, prequential
@@ -51,18 +52,20 @@ def run_cells(
     early_samples: int,
     workers: Workers = THIS_PROCESS,
     costs: bool = False,
+    kept: FeatureFiles | None = None,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells that the same features serve; results are JSON values.
 
-    Early decision, prequential accuracy and filters are of the base setting and the first fold.
+    Early decision is of the base setting, prequential accuracy and filters are of its first fold.
 
     Args:
         data: the recordings.
         cells: what to run; features are made once, also for several folds where those do not change them.
         report: told about progress.
-        early_samples: held-out samples for early decision; none if 0.
+        early_samples: held-out samples for early decision, from all folds together; none if 0.
         workers: learn and encode; see `make_features`.
         costs: time an update of one event, where the method has an encoder.
+        kept: features that do not depend on the fold are kept there.
 
     Yields:
         each cell and its result as soon as it is done.
@@ -72,6 +75,7 @@ def run_cells(
     """
     cell = cells[0]
     fold = None if cell.has_features_of_all_folds else cell.fold
+    encode = kept.encoded if kept and fold is None else encode_recordings
     with data.open(fold) as recordings:
         with PeakMemory() as making:
             started = time.perf_counter()
@@ -82,13 +86,13 @@ def run_cells(
                 update_us(features, _samples(recordings)) if costs and isinstance(features, Encoder) else None
             )
             encoding = time.perf_counter()
-            samples = encode_recordings(features, recordings, report, workers=workers)
+            samples = encode(features, recordings, report, workers=workers)
             seconds = {PLAIN: time.perf_counter() - encoding}
             others: dict[Variant, EncodedSamples] = {}
             images: EncodedSamples | None = None
             if any(cell.setting.test_mirror for cell in cells):
                 started_one = time.perf_counter()
-                images = encode_recordings(
+                images = encode(
                     features, recordings, report, variant=_MIRRORED, held_out_too=True, workers=workers
                 )
                 seconds[_MIRRORED] = time.perf_counter() - started_one
@@ -96,23 +100,26 @@ def run_cells(
             wanted = dict.fromkeys(v for cell in cells for v in cell.setting.variants)
             for variant in [v for v in wanted if v not in others]:
                 started_one = time.perf_counter()
-                others[variant] = encode_recordings(
-                    features, recordings, report, variant=variant, workers=workers
-                )
+                others[variant] = encode(features, recordings, report, variant=variant, workers=workers)
                 seconds[variant] = time.perf_counter() - started_one
-        for cell in cells:
+        trained: tuple[Any, ...] = ()
+        for cell in sorted(cells, key=_training):
             with PeakMemory() as training:
                 variants = cell.setting.variants
                 split = _split(samples, [others[v] for v in variants], data, cell if fold is None else None)
-                result = _scored(cell, data, features, *split, images, report)
-                if cell.fold == 0 and not cell.swept:
-                    classifier = result["classifier"]
-                    result |= _looked_into(
-                        cell, features, classifier, split[0], recordings, report, early_samples
+                if _training(cell) not in trained:
+                    trained = (_training(cell), *_trained(cell, data, features, *split, report))
+                _, classifier, train_s = trained
+                result = _scored(cell, data, features, split[0], classifier, images)
+                if not cell.swept:
+                    result |= _early(
+                        cell, data, features, classifier, split[0], recordings, report, early_samples
                     )
-            del result["classifier"]
+                    if cell.fold == 0:
+                        result |= _looked_into(cell, features, split[0], recordings, report)
             if cost is not None:
                 result["update_us"] = round(cost, 3)
+            result["train_s"] = round(train_s, 3)
             result["learn_s"] = round(learned - started, 3)
             encoded = {PLAIN, *variants} | ({_MIRRORED} if cell.setting.test_mirror else set())
             result["encode_s"] = round(sum(seconds[v] for v in encoded), 3)
@@ -159,30 +166,48 @@ def _of(samples: EncodedSamples, some: NDArray[np.bool_]) -> EncodedSamples:
     return EncodedSamples(rows, labels, sources, samples.held_out[some])
 
 
-def _scored(
+def _training(cell: Cell) -> tuple[int, str]:
+    """Equal for cells of the same features that one classifier serves."""
+    return cell.fold, repr(replace(cell.setting, test_mirror=False))
+
+
+def _trained(
     cell: Cell,
     data: DataSet,
     features: FeatureMap,
     samples: EncodedSamples,
     others: Sequence[EncodedSamples],
-    images: EncodedSamples | None,
     report: Report,
-) -> dict[str, Any]:
-    """Train and score; the classifier is part of what is found."""
+) -> tuple[Classifier | KernelClassifier, float]:
+    """The classifier of a cell, and the seconds that it took."""
     started = time.perf_counter()
-    report("training", 0, 0, f"{_INNER_FOLDS}-fold cross-validation")
     rows, labels, numbers = training_set(samples, others)
     sources = samples.sources[~samples.held_out].tolist()
     parts = assign_folds(labels[: len(sources)], sources, _INNER_FOLDS, data.groups, data.seed)
-    classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True)
-    trained = time.perf_counter()
+    classifier = train(cell.setting.kernel, rows, labels, features, parts[numbers], alone=True, report=report)
+    seconds = time.perf_counter() - started
     report("training", 1, 1, "")
-    mirrored = images.rows[samples.held_out] if images and cell.setting.test_mirror else None
-    predicted = predict_all(classifier, samples.rows[samples.held_out], mirrored)
-    true = samples.labels[samples.held_out].tolist()
-    result: dict[str, Any] = {} if mirrored is not None else _confidence(classifier, samples)
+    return classifier, seconds
+
+
+def _scored(
+    cell: Cell,
+    data: DataSet,
+    features: FeatureMap,
+    samples: EncodedSamples,
+    classifier: Classifier | KernelClassifier,
+    images: EncodedSamples | None,
+) -> dict[str, Any]:
+    """How well a classifier does on the held-out samples; with mirror images there are no probabilities."""
+    rows, true = samples.rows[samples.held_out], samples.labels[samples.held_out].tolist()
+    result: dict[str, Any] = {}
+    if images and cell.setting.test_mirror:
+        predicted = predict_all(classifier, rows, images.rows[samples.held_out])
+    else:
+        likely = classifier.emitted(rows)
+        predicted = [classifier.labels[i] for i in likely.argmax(axis=-1)]
+        result["confidence"] = _confidence(classifier.labels, likely, true)
     return result | {
-        "classifier": classifier,
         "samples": [int(np.sum(~samples.held_out)), len(true)],
         # A digit for each held-out sample in stored order: settings are compared sample by sample.
         "hits": "".join("01"[a == b] for a, b in zip(true, predicted, strict=True)),
@@ -190,23 +215,20 @@ def _scored(
         "features": features.n_features,
         "C": classifier.provenance.get("C"),
         "kernel": "rbf" if isinstance(classifier, KernelClassifier) else "linear",
-        "train_s": round(trained - started, 3),
     }
 
 
-def _confidence(
-    classifier: Classifier | KernelClassifier, samples: EncodedSamples
-) -> dict[str, list[list[float]]]:
+def _confidence(labels: Sequence[str], likely: NDArray[np.float32], true: Sequence[str]) -> list[list[float]]:
     """For the error of calibration over all folds: bins of the held-out samples whose label is known."""
-    true = samples.labels[samples.held_out]
-    known = np.isin(true, classifier.labels)
-    places = np.searchsorted(classifier.labels, true[known])
-    likely = classifier.emitted(samples.rows[samples.held_out][known])
-    return {"confidence": confidence_bins(likely, places).round(4).tolist()}
+    known = np.isin(true, labels)
+    places = np.searchsorted(labels, np.array(true)[known])
+    found: list[list[float]] = confidence_bins(likely[known], places).round(4).tolist()
+    return found
 
 
-def _looked_into(
+def _early(
     cell: Cell,
+    data: DataSet,
     features: FeatureMap,
     classifier: Classifier | KernelClassifier,
     samples: EncodedSamples,
@@ -214,7 +236,26 @@ def _looked_into(
     report: Report,
     early_samples: int,
 ) -> dict[str, Any]:
-    """Results that are made for the base setting only."""
+    """Early decision on a fold's part of so many samples."""
+    wanted = early_samples // data.n_folds + (cell.fold < early_samples % data.n_folds)
+    chosen = _evenly(recordings, samples.held_out.tolist(), wanted, report) if wanted else []
+    if not chosen:
+        return {}
+    report("early decision", 0, 1, f"{len(chosen)} samples")
+    longest = max(label.duration_us for labels in data.labels for label in labels)
+    found = early_decision(features, classifier, chosen, longest)
+    report("early decision", 1, 1, "")
+    return {"early": {"samples": len(chosen), **found}}
+
+
+def _looked_into(
+    cell: Cell,
+    features: FeatureMap,
+    samples: EncodedSamples,
+    recordings: Sequence[Recording],
+    report: Report,
+) -> dict[str, Any]:
+    """Results that are made for the base setting and the first fold only."""
     report("prequential", 0, 1, "")
     order = np.random.default_rng(cell.setting.seed).permutation(len(samples.labels))
     labels = samples.labels.tolist()
@@ -225,14 +266,8 @@ def _looked_into(
         }
     }
     report("prequential", 1, 1, "")
-    held_out = samples.held_out.tolist()
-    chosen = _evenly(recordings, held_out, early_samples, report) if early_samples else []
-    if chosen:
-        report("early decision", 0, 1, f"{len(chosen)} samples")
-        result["early"] = {"samples": len(chosen), **early_decision(features, classifier, chosen)}
-        report("early decision", 1, 1, "")
     if isinstance(features, Encoder):
-        some = _evenly(recordings, held_out, _CODED_SAMPLES, report)
+        some = _evenly(recordings, samples.held_out.tolist(), _CODED_SAMPLES, report)
         result["learned"] = _learned(features) | code_statistics(features, some, cell.setting.seed)
     return result
 

@@ -18,6 +18,7 @@ from streamfeat.classify.calibration import error_of_bins
 from streamfeat.engine.encoder import Encoder
 from streamfeat.errors import InputError
 from streamfeat.evaluate.cell import run_cells
+from streamfeat.evaluate.feature_files import FeatureFiles
 from streamfeat.evaluate.leakage import check_leakage
 from streamfeat.evaluate.methods import Report, model_path
 from streamfeat.evaluate.plan import Cell
@@ -25,6 +26,7 @@ from streamfeat.evaluate.published import ACCURACIES, PAPER, PAPER_SWEEPS, SWEEP
 from streamfeat.evaluate.scores import (
     SHARE,
     accuracy_interval,
+    joined_decisions,
     paired_interval,
     time_to_share,
 )
@@ -36,7 +38,7 @@ from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = ["StateFile", "evaluate", "read_result", "save_result", "state_path"]
 
-_VERSION = 5
+_VERSION = 6
 
 _UNITS_IN_WORDS = {
     "block": "runs of neighbouring samples, 25 of each class",
@@ -158,6 +160,7 @@ def evaluate(
     workers: Workers = THIS_PROCESS,
     against: Mapping[str, Any] | None = None,
     costs: bool = False,
+    features: Path | None = None,
 ) -> dict[str, Any]:
     """Run all cells that are not done, and add up the result (JSON values).
 
@@ -171,6 +174,7 @@ def evaluate(
         workers: learn and encode.
         against: an earlier result, from `read_result`; each row has its difference to the first row there.
         costs: time updates, see `run_cells`.
+        features: directory in which features of models are kept, for other runs.
 
     Raises:
         InputError: see `run_cells` and `StateFile`; or the earlier result is of other samples.
@@ -185,6 +189,7 @@ def evaluate(
         "early_samples": early_samples,
         "models": _models(cells),
     } | data.identity
+    kept_features = FeatureFiles(features, data) if features else None
     rows: list[dict[str, Any]] = []
     earlier = _hits_of(against, data) if against else ""
     with closing(StateFile(state, header)) as kept:
@@ -203,6 +208,7 @@ def evaluate(
                     early_samples=early_samples,
                     workers=workers,
                     costs=costs,
+                    kept=kept_features,
                 ):
                     kept.add(one, result)
             if cell.fold == data.n_folds - 1:
@@ -321,14 +327,14 @@ def _row(cell: Cell, folds: Sequence[dict[str, Any]], units: NDArray[np.int64]) 
         row["calibration_error"] = round(error_of_bins(bins), 4)
     if all("update_us" in fold for fold in folds):
         row["update_us"] = round(float(np.median([fold["update_us"] for fold in folds])), 3)
-    for name in ("prequential", "early", "learned"):
+    for name in ("prequential", "learned"):
         if name in folds[0] and not cell.swept:
             row[name] = folds[0][name]
-    if "early" in row:
-        early = row["early"]
+    if early := [fold["early"] for fold in folds if "early" in fold]:
+        row["early"] = joined = joined_decisions(early)
         row["share_reached"] = {
             "share": SHARE,
-            "ms": time_to_share(early["time"], "ms"),
-            "events": time_to_share(early["events"], "events"),
+            "ms": time_to_share(joined["time"], "ms"),
+            "events": time_to_share(joined["events"], "events"),
         }
     return row

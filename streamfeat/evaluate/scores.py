@@ -21,6 +21,7 @@ __all__ = [
     "accuracy_interval",
     "confusion",
     "early_decision",
+    "joined_decisions",
     "paired_interval",
     "predict_all",
     "prequential",
@@ -98,17 +99,21 @@ def predict_all(
 
 
 def early_decision(
-    features: FeatureMap, classifier: Classifier | KernelClassifier, samples: Sequence[Sample]
+    features: FeatureMap,
+    classifier: Classifier | KernelClassifier,
+    samples: Sequence[Sample],
+    longest_us: int,
 ) -> dict[str, list[dict[str, float]]]:
     """Accuracy when a sample has been seen for some time only, or some of its events.
 
-    The window ends where the decision is made, as that of a running engine does, while the classifier was
-    trained on whole samples. A sample that has ended by then counts with all that it has.
+    The window ends where the decision is made, as that of a running engine does. A sample that has ended by
+    then counts with all that it has.
 
     Args:
         features: of windows.
-        classifier: trained on whole samples.
+        classifier: trained on other samples.
         samples: held-out samples, in memory.
+        longest_us: times are shares of it.
 
     Returns:
         `time`: points `{"ms", "accuracy"}`; `events`: points `{"events", "accuracy"}`. The last is the whole.
@@ -117,7 +122,6 @@ def early_decision(
         replace(sample, events=sample.events[np.argsort(sample.events["t"], kind="stable")])
         for sample in samples
     ]
-    longest = max(sample.label.duration_us for sample in ordered)
     most = max(len(sample.events) for sample in ordered)
     counts = [_FIRST_EVENTS]
     while counts[-1] < most:
@@ -129,7 +133,7 @@ def early_decision(
             right += classifier.predict(row) == label.label
         return right / len(cut)
 
-    times = [round(share * longest) for share in _TIMES]
+    times = [round(share * longest_us) for share in _TIMES]
     return {
         "time": [
             {"ms": t / 1000, "accuracy": accuracy([_first_us(sample, t) for sample in ordered])}
@@ -143,6 +147,28 @@ def early_decision(
             for count in counts
         ],
     }
+
+
+def joined_decisions(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Early decision on the samples of several folds together.
+
+    Args:
+        parts: of each fold, `samples` and what `early_decision` found, at the same times. A fold whose
+            samples have fewer events than those of others counts with whole samples beyond.
+    """
+    n = sum(part["samples"] for part in parts)
+
+    def joined(axis: str, unit: str) -> list[dict[str, float]]:
+        found = []
+        for i in range(max(len(part[axis]) for part in parts)):
+            points = [part[axis][min(i, len(part[axis]) - 1)] for part in parts]
+            right = sum(
+                round(point["accuracy"] * part["samples"]) for point, part in zip(points, parts, strict=True)
+            )
+            found.append({unit: max(point[unit] for point in points), "accuracy": right / n})
+        return found
+
+    return {"samples": n, "time": joined("time", "ms"), "events": joined("events", "events")}
 
 
 def _first_us(sample: Sample, t_us: int) -> Sample:

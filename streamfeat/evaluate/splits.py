@@ -104,6 +104,7 @@ class DataSet:
         names: the classes, sorted.
         groups: as given.
         seed: as given.
+        topic: as given.
         scored: what is scored, in words.
         n_folds: 1 where that is a held-out split.
         assumptions: what the recordings leave open, a line each.
@@ -129,7 +130,7 @@ class DataSet:
             raise InputError(f"--on {on} is unknown; choose held-out or train")
         self.groups, self.seed = groups_named(groups), seed
         self.paths = list(paths)
-        self._topic, self._reading = topic, reading
+        self.topic, self._reading = topic, reading
         self.labels: list[list[Label]] = []
         self.assumptions: list[str] = []
         for path in self.paths:
@@ -205,16 +206,16 @@ class DataSet:
         with contextlib.ExitStack() as files:
             if self._folds and fold is None:
                 yield [
-                    files.enter_context(Fold(path, self._topic, reading=self._reading)) for path in self.paths
+                    files.enter_context(Fold(path, self.topic, reading=self._reading)) for path in self.paths
                 ]
             elif not self._folds:
                 yield [
-                    files.enter_context(open_recording(path, self._topic, self._reading))
+                    files.enter_context(open_recording(path, self.topic, self._reading))
                     for path in self.paths
                 ]
             else:
                 yield [
-                    files.enter_context(Fold(path, self._topic, held_out, reading=self._reading))
+                    files.enter_context(Fold(path, self.topic, held_out, reading=self._reading))
                     for path, held_out in zip(self.paths, self._folds[fold or 0], strict=True)
                 ]
 

@@ -268,7 +268,8 @@ def notes(result: dict[str, Any]) -> list[str]:
         )
     setting = base_rows(result)[0]["setting"]
     more = ["mirror images"] if setting["mirror"] else []
-    more += [f"beginnings of {setting['cuts']} ms"] if setting["cuts"] else []
+    if cuts := setting["cuts"].strip():
+        more += [f"beginnings of {cuts} ms"]
     more += [f"copies moved by {setting['shift']} pixels"] if setting["shift"] else []
     if more:
         lines.append(f"Trained, for every method, on {', '.join(more)} of the training samples as well.")
@@ -295,10 +296,11 @@ def notes(result: dict[str, Any]) -> list[str]:
         )
     early = next((row["early"] for row in result["rows"] if "early" in row), None)
     if early:
+        whole = "" if setting["cuts"] else ", and training was on whole samples (--cuts any decides earlier)"
         lines.append(
             f"Early decision: {early['samples']:,} held-out samples, cut off after some time or some events; "
-            "the window ends at the cut, the classifier was trained on whole samples. Times are the first "
-            "measured points from which on the accuracy stays above the share."
+            f"the window ends at the cut{whole}. Times are the first measured points from which on the "
+            "accuracy stays above the share."
         )
     online = next((row["prequential"] for row in result["rows"] if "prequential" in row), None)
     if online:
