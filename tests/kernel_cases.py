@@ -1132,6 +1132,7 @@ MEMORY_SURFACES = {
 TIME_SURFACES = {
     "no event": lambda call: len(call.t) == 0,
     "no radius": lambda call: call.out.shape[2] == 1,
+    "polarities of a layer": lambda call: len(call.p) > 0 and call.p.max() > 1,
     "a pixel that was never seen": lambda call: call.out.size > 0 and call.latest.shape[1] > len(call.t),
     "two events of one pixel": lambda call: len(set(zip(call.x, call.y, call.p, strict=True))) < len(call.t),
 }

@@ -939,7 +939,7 @@ def rewind(rng, plane, operator, state):
     for row in range(coded):
         sums = state.pooled[plane, naive.cell_index(row, operator.shape, operator.pooling)]
         if operator.steps is not None:
-            naive.pool_row_of(None, None, plane, row, 1, 0, operator, state, sums)
+            naive.pool_row_of(None, None, None, plane, row, 1, 0, operator, state, sums)
             continue
         row_of = (field[plane, row] for field in (state.projections, state.moments, state.atoms))
         naive.encode_volume(*row_of, False, 0, operator, state)
@@ -975,7 +975,7 @@ def make_project_volume(rng):
 
 def make_enter_atoms(rng):
     operator, state = parts_of(read_engine(rng))
-    return operator.wide, *random_row(rng, state), random_part(rng, state), operator, state
+    return operator.lasso, *random_row(rng, state), random_part(rng, state), operator, state
 
 
 CLOSED_KINDS = [("direct", "soft"), ("direct", "split")]
@@ -1302,14 +1302,14 @@ def make_pool_narrow(rng):
     return int(pick(rng, [-1, 1])), *row, pooled
 
 
-def states_of(operator):
-    """The first arguments of what is compiled for one of the two states."""
-    return operator.upper, operator.wide
+def kinds_of(operator):
+    """The first arguments of what is compiled for one kind of state."""
+    return operator.upper, operator.wide, operator.lasso
 
 
 def make_follow_changes(rng):
     *arguments, operator, state = make_change_volume(rng)
-    return *states_of(operator), *arguments, operator, state
+    return *kinds_of(operator), *arguments, operator, state
 
 
 def exact_once_moved(kernel: Run, twin: Run) -> None:
@@ -1327,18 +1327,18 @@ def make_write_code(rng):
     arguments = make_encode_volume(rng)
     while not arguments[1][MOMENT_SQUARES]:
         arguments = make_encode_volume(rng)
-    return *states_of(arguments[-2]), *arguments
+    return *kinds_of(arguments[-2]), *arguments
 
 
 def make_pool_row_of(rng):
     plane, volume, _, sign, part, operator, state = make_pool_volume(rng)
     sums = np.zeros_like(state.pooled[0, 0])
-    return *states_of(operator), plane, volume, sign, part, operator, state, sums
+    return *kinds_of(operator), plane, volume, sign, part, operator, state, sums
 
 
 def make_write_features(rng):
     operator, state, features = make_read_features(rng)
-    return operator.steps, operator.wide, operator, state.pooled[0].copy(), features
+    return operator.steps, operator, state.pooled[0].copy(), features
 
 
 def make_change_place(rng):
@@ -1582,9 +1582,11 @@ def make_add_memory_surfaces(rng):
 
 def make_time_surfaces(rng):
     height, width, side = int(rng.integers(1, 9)), int(rng.integers(1, 9)), 2 * int(rng.integers(0, 4)) + 1
-    events = _surface_events(rng, height, width, random_length(rng, 60))
-    latest = np.full((2, height + side - 1, width + side - 1), -np.inf)
-    return *events, latest, np.empty((len(events[0]), 2, side, side), np.float32)
+    x, y, p, t = _surface_events(rng, height, width, random_length(rng, 60))
+    n_polarities = int(rng.choice([2, 2, 5]))  # of a camera, or of a layer of HOTS
+    p = p if n_polarities == 2 else rng.integers(0, n_polarities, len(p))
+    latest = np.full((n_polarities, height + side - 1, width + side - 1), -np.inf)
+    return x, y, p, t, latest, np.empty((len(x), n_polarities, side, side), np.float32)
 
 
 def make_describe_events(rng):

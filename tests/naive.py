@@ -639,10 +639,10 @@ def encode_volume(projection, moments, atoms, fresh, part, operator, state):
         if fresh:
             atoms[:] = 0
         return
-    write_code(None, None, projection, moments, atoms, fresh, part, operator, state)
+    write_code(None, None, None, projection, moments, atoms, fresh, part, operator, state)
 
 
-def write_code(narrow, wide, projection, moments, atoms, fresh, part, operator, state):
+def write_code(narrow, wide, lasso, projection, moments, atoms, fresh, part, operator, state):
     code = state.code[part, 0]
     if operator.steps is not None:
         narrow_code(narrow_gain(moments, operator), projection, operator.upper, operator.lower, code)
@@ -661,7 +661,7 @@ def write_code(narrow, wide, projection, moments, atoms, fresh, part, operator, 
 
 def pool_volume(plane, row, volume, sign, part, operator, state):
     sums = [state.pooled, *state.partial][part][plane, cell_index(volume, operator.shape, operator.pooling)]
-    pool_row_of(None, None, plane, row, sign, part, operator, state, sums)
+    pool_row_of(None, None, None, plane, row, sign, part, operator, state, sums)
     state.encoded[part] += sign > 0
 
 
@@ -672,7 +672,7 @@ def read_cell(cell, operator, state, features):
     features.reshape(cells, -1)[cell] = whole.reshape(cells, -1)[cell]
 
 
-def pool_row_of(narrow, wide, plane, row, sign, part, operator, state, sums):
+def pool_row_of(narrow, wide, lasso, plane, row, sign, part, operator, state, sums):
     projection, moments, atoms = (
         field[plane, row] for field in (state.projections, state.moments, state.atoms)
     )
@@ -684,10 +684,10 @@ def pool_row_of(narrow, wide, plane, row, sign, part, operator, state, sums):
 
 
 def read_features(operator, state, features):
-    write_features(None, None, operator, state.pooled[int(state.clock[CLOCK_PLANE])], features)
+    write_features(None, operator, state.pooled[int(state.clock[CLOCK_PLANE])], features)
 
 
-def write_features(steps, wide, operator, pooled, features):
+def write_features(steps, operator, pooled, features):
     parts = pooled.astype(np.int64).reshape(len(pooled), -1, len(operator.offset))[:, :, : operator.n_filters]
     if operator.steps is not None:
         if operator.kind != SPLIT:
@@ -782,7 +782,7 @@ def project_volume(plane, volume, ahead, start, most, part, operator, state):
     return min(most, len(filled)), following
 
 
-def enter_atoms(wide, plane, row, part, operator, state):
+def enter_atoms(lasso, plane, row, part, operator, state):
     if operator.inverse:
         atoms = state.atoms[plane, row]
         atoms[1] = operator.gram.astype(np.float64) @ atoms[0]
@@ -1014,7 +1014,7 @@ def move_volume(plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
 
 
-def follow_changes(narrow, wide, plane, volume, n, part, operator, state):
+def follow_changes(narrow, wide, lasso, plane, volume, n, part, operator, state):
     change_volume(plane, volume, n, part, operator, state)
 
 

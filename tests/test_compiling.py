@@ -28,18 +28,20 @@ class Heard(event.Listener):
 
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.random_encoder import random_encoder
-from streamfeat.stream.compiling import compile_together, is_compiled
+from streamfeat.stream.compiling import compile_together, is_compiled, state_of
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.warming import warm_up
 
-narrow = sys.argv[1] == "narrow"
-assert not is_compiled(narrow=narrow)
-compile_together(narrow=narrow)
-assert is_compiled(narrow=narrow)
+state = sys.argv[1]
+assert not is_compiled(state)
+compile_together(state)
+assert is_compiled(state)
 event.register("numba:compile", Heard())
-encoding = "soft" if narrow else "triangle"
-encoder = random_encoder(0, Geometry(patch=6, n_bins=2, bin_us=5_000), 5, encoding=encoding, narrow=narrow)
-assert encoder.is_narrow == narrow
+geometry = Geometry(patch=6, n_bins=2, bin_us=5_000)
+formulation = "inverse" if state == "lasso" else "direct"
+encoding = "triangle" if state == "wide" else "soft"
+encoder = random_encoder(0, geometry, 5, formulation, encoding, narrow=state == "narrow")
+assert state_of(encoder) == state
 warm_up(encoder, EmitPolicy.parse("10ms"))
 print(*compiled)
 """
@@ -53,7 +55,7 @@ def empty(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
-@pytest.mark.parametrize("state", ["narrow"])  # as `learn` makes them; both take a minute more
+@pytest.mark.parametrize("state", ["narrow"])  # as `learn` makes them; the others take a minute more
 def test_nothing_is_left_to_compile(tmp_path, state):
     done = subprocess.run(
         [sys.executable, "-c", LEFT, state],
@@ -70,7 +72,7 @@ def test_nothing_is_left_to_compile(tmp_path, state):
 
 @pytest.mark.skipif(compiling._cores() < 2, reason="a single core compiles in one process")
 def test_the_processes_end_when_they_are_told(empty):
-    with compiling.Compilers(narrow=False) as compilers:
+    with compiling.Compilers("wide") as compilers:
         assert compilers.is_alive()
         processes = list(compilers._started)
         assert len(processes) == 2
@@ -100,7 +102,7 @@ def test_a_half_does_not_wait_for_one_that_is_gone(empty, monkeypatch):
         return process
 
     monkeypatch.setattr(compiling.Compilers, "_start", start)
-    compiling.compile_together(narrow=False)
+    compiling.compile_together("wide")
     assert [process.returncode for process in started] == [-6, 0]
 
 
@@ -114,11 +116,11 @@ def test_of_two_commands_one_compiles_and_the_other_waits_for_it(empty, monkeypa
             or process
         ),
     )
-    with compiling.Compilers(narrow=False) as second:
+    with compiling.Compilers("wide") as second:
         second.close()
-    with compiling.Compilers(narrow=False) as first:
-        second = compiling.Compilers(narrow=False)
-        other_state = compiling.Compilers(narrow=True)
+    with compiling.Compilers("wide") as first:
+        second = compiling.Compilers("wide")
+        other_state = compiling.Compilers("narrow")
         assert (len(first._started), len(second._started), len(other_state._started)) == (2, 0, 2)
         assert first.is_alive()
         assert second.is_alive()
@@ -126,7 +128,7 @@ def test_of_two_commands_one_compiles_and_the_other_waits_for_it(empty, monkeypa
         first.close()  # killed before it was done: whoever waits goes on with it
         assert second.is_alive()
         assert len(second._started) == 2
-        third = compiling.Compilers(narrow=False)
+        third = compiling.Compilers("wide")
         monkeypatch.setattr(third, "_until_s", 0)
         assert not third.is_alive()
         third.close()
@@ -145,7 +147,7 @@ def test_no_process_where_it_would_be_of_no_use(empty, monkeypatch, reason):
         monkeypatch.setattr(sys, "executable", "")
     elif reason == "no room for a process":
         monkeypatch.setattr(subprocess, "Popen", refuse)
-    with compiling.Compilers(narrow=False) as compilers:
+    with compiling.Compilers("wide") as compilers:
         assert not compilers.is_alive()
         compilers.wait()
 
@@ -165,7 +167,7 @@ def test_a_pipe_is_told_why_nothing_comes(run, tmp_path, monkeypatch, command):
     monkeypatch.setattr(compiling, "_cores", lambda: 1)  # nothing is started
     told = {}
     for compiled in (True, False):
-        monkeypatch.setattr(compiling, "is_compiled", lambda narrow, compiled=compiled: compiled)
+        monkeypatch.setattr(compiling, "is_compiled", lambda state, compiled=compiled: compiled)
         told[compiled] = run(*line)
         assert told[compiled].status == 0, told[compiled].err
     assert "compiling" not in told[True].err

@@ -30,7 +30,7 @@ from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.run import StateFile, evaluate, state_path
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes, gabor_filters
 from streamfeat.evaluate.splits import DataSet, Fold
-from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
+from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram, SurfaceLayer
 from streamfeat.events import make_events
 from streamfeat.learn.chunks import ChunkedVolumes
 from streamfeat.learn.initial import random_filters, spherical_means
@@ -42,7 +42,12 @@ QUICK = ["--patch", "4", "--bins", "2", "--filters", "12", "--volumes", "600", "
 BASELINES = [
     CountImage(4),
     AveragedSurfaces((12, 16), cell=5, radius=2),
-    SurfaceHistogram(np.random.default_rng(0).random((6, 50), np.float32), radius=2),
+    SurfaceHistogram(
+        (
+            SurfaceLayer(np.random.default_rng(0).random((6, 50), np.float32), 2, 2e4),
+            SurfaceLayer(np.random.default_rng(1).random((5, 150), np.float32), 2, 2e5),
+        )
+    ),
     RetinalWords(np.random.default_rng(0).random((6, 84), np.float32), remembered=20),
 ]
 
@@ -331,10 +336,45 @@ def test_averaged_surfaces_end_at_their_cell():
 def test_a_histogram_of_surfaces_counts_each_event_in_its_quadrant():
     alone = np.zeros((2, 2, 3, 3), np.float32)
     alone[0, 0, 1, 1] = alone[1, 1, 1, 1] = 1  # an OFF event, an ON event, and nothing else around
-    hots = SurfaceHistogram(alone.reshape(2, 18), radius=1)
+    hots = SurfaceHistogram((SurfaceLayer(alone.reshape(2, 18), 1, 2e4),))
     events = make_events([0, 7, 7, 0], [0, 0, 7, 7], [0, 1, 1, 0], [0, 1, 2, 3])
     counts = hots.encode(events, (8, 8)).reshape(2, 2, 2)
     assert counts.tolist() == [[[1, 0], [0, 1]], [[1, 0], [0, 1]]]
+
+
+def test_a_later_layer_sees_the_answers_of_the_one_before():
+    # The first layer turns polarities around, the second tells whether one of its own kind lies to the left.
+    alone = np.zeros((2, 2, 1, 1), np.float32)
+    alone[0, 1] = alone[1, 0] = 1
+    left = np.zeros((3, 2, 3, 3), np.float32)
+    left[0, :, 1, 1] = 0.5  # nothing but the event itself, of either kind
+    left[1, 0, 1, :2] = left[2, 1, 1, :2] = 1
+    layers = SurfaceLayer(alone.reshape(2, 2), 0, 1e3), SurfaceLayer(left.reshape(3, 18), 1, 1e9)
+    hots = SurfaceHistogram(layers)
+    events = make_events([0, 4, 5, 9, 10], [0, 2, 2, 2, 2], [1, 1, 1, 0, 0], [0, 1, 2, 3, 4])
+    columns = [events[name].astype(np.int64) for name in "xypt"]
+    assert hots.seen(columns, (4, 12))[2].tolist() == [0, 0, 1, 0, 2]
+    assert hots.n_features == 12
+    assert hots.encode(events, (4, 12)).reshape(4, 3)[:, :].sum(axis=0).tolist() == [3, 1, 1]
+
+
+def test_chunks_of_events_change_nothing_in_hots(monkeypatch):
+    hots = BASELINES[2]
+    events = tiny.steady(0, 50_000, 900)
+    whole = hots.encode(events, tiny.RESOLUTION)
+    monkeypatch.setattr("streamfeat.evaluate.surfaces._CHUNK", 64)
+    np.testing.assert_array_equal(hots.encode(events, tiny.RESOLUTION), whole)
+    assert np.count_nonzero(whole) > 4
+
+
+def test_hots_draws_from_three_layers_and_wants_events(digits, tmp_path):
+    with open_recording(digits) as recording:
+        hots = SurfaceHistogram.fitted([recording], 200)
+    assert [layer.prototypes.shape for layer in hots.layers] == [(4, 50), (8, 324), (16, 2312)]
+    assert [(layer.n_polarities, layer.tau_us) for layer in hots.layers] == [(2, 1e4), (4, 1e5), (8, 1e6)]
+    few = tiny.write_items(tmp_path / "few.mcap", tiny.labelled_items(1))
+    with open_recording(few) as recording, pytest.raises(InputError, match="hots has nothing to learn from"):
+        SurfaceHistogram.fitted([recording], 3)
 
 
 def moving_bar(upright):
@@ -380,8 +420,7 @@ def test_spikes_do_not_depend_on_where_a_batch_ends(network):
 
 def test_surface_prototypes_are_the_same_from_the_same_seed(digits):
     with open_recording(digits) as recording:
-        first, again = (SurfaceHistogram.fitted([recording], 8, 500, seed=3) for _ in range(2))
-    assert first.prototypes.shape == (8, 98)
+        first, again = (SurfaceHistogram.fitted([recording], 200, seed=3) for _ in range(2))
     assert first.fingerprint == again.fingerprint
 
 

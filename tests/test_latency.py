@@ -22,12 +22,12 @@ from streamfeat.engine.engine import Engine
 from streamfeat.errors import InputError
 from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
-from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
+from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage
 from streamfeat.events import make_events
 from streamfeat.latency.end_to_end import measure_end_to_end, without_silence
 from streamfeat.latency.histogram import PERCENTILES, Latencies, RecentLatencies
 from streamfeat.latency.measure import LatencyReport
-from streamfeat.latency.others import TIMED, Method, any_prototypes, any_words, walk_method
+from streamfeat.latency.others import TIMED, Method, any_layers, any_words, walk_method
 from streamfeat.latency.stopwatch import clock_cost_ns, follow_timed, python_clock_cost_ns
 from streamfeat.latency.text import spell
 from streamfeat.latency.update import call_each, feed_and_read, walk
@@ -428,7 +428,7 @@ def test_one_split_without_look_ahead(run, home):
 
 OTHERS = {
     "hats": lambda columns, events, resolution: AveragedSurfaces(resolution).encode(events, resolution),
-    "hots": lambda columns, events, resolution: SurfaceHistogram(any_prototypes()).encode(events, resolution),
+    "hots": lambda columns, events, resolution: any_layers().encode(events, resolution),
     "dart": lambda columns, events, resolution: RetinalWords(any_words()).encode(events, resolution),
     "hfirst": lambda columns, events, resolution: FirstSpikes().counter(resolution)(*columns).ravel(),
     "gabor-snn": lambda columns, events, resolution: LeakySpikes().counter(resolution)(*columns).ravel(),

@@ -101,7 +101,24 @@ def test_the_border_of_an_image_is_never_seen_or_is_black_all_around(tmp_path):
     done, samples = simulate_to(tmp_path / "crop.mcap", tmp_path / "set")
     # 30x60 fits into 40x50 as 25x50, of which 7 pixels are lost; the white one shows nothing at all.
     assert [s.resolution for s in samples.values()] == [(18, 43)]
-    assert "white.png: gives no events" in done.failed[0][1]
+    assert "white.png: is all of one grey" in done.failed[0][1]
+
+
+def test_around_an_image_all_may_be_as_its_border(tmp_path):
+    dark = np.full((28, 28), 255, np.uint8)
+    dark[10:18, 10:18] = 0
+    save(tmp_path / "set" / "a" / "dark.png", dark)
+    save(tmp_path / "set" / "a" / "white.png", np.full((28, 28), 255, np.uint8))
+    edge = Scene(replace(SCENE.camera, resolution=(34, 34)), amplitude_px=3.0, border="edge")
+    done, samples = simulate_to(tmp_path / "edge.mcap", tmp_path / "set", edge)
+    assert "white.png: is all of one grey" in done.failed[0][1]
+    (sample,) = samples.values()
+    events = sample.events
+    assert sample.resolution == (34, 34)
+    assert 7 < events["x"].min() < events["x"].max() < 26
+    # It goes down first: the lower side darkens where the upper one brightens.
+    first = events[events["t"] - events["t"].min() < 90_000]
+    assert first["y"][first["p"] == 0].mean() > first["y"][first["p"] == 1].mean() + 3
 
 
 def test_transparent_is_black_and_16_bits_are_16_bits(tmp_path):
@@ -134,6 +151,7 @@ def hostile(folder):
     (folder / "a" / "empty.gif").write_bytes(b"")
     (folder / "a" / "gone.png").symlink_to(folder / "nowhere.png")
     save(folder / "a" / "one.png", np.zeros((1, 1), np.uint8))
+    save(folder / "a" / "grey.png", np.full((30, 40), 90, np.uint8))
     save(folder / "a" / "strip.png", np.zeros((2, 90), np.uint8))
     save(folder / "a" / "float.tif", np.zeros((9, 9), np.float32))
     save(folder / "a" / "deep.tif", np.full((9, 9), 70_000, np.int32))
@@ -143,6 +161,7 @@ def hostile(folder):
         "empty": "no image",
         "gone": "leads nowhere",
         "one": "one pixel",
+        "grey": "one grey",
     }
     return reasons | {"strip": "too narrow", "float": "floating-point", "deep": "16 bits"}
 
@@ -157,6 +176,7 @@ def test_images_that_cannot_be_used_are_counted_and_the_others_are_there(tmp_pat
     }
     assert told.keys() == reasons.keys()
     assert all(reason in told[name] for name, reason in reasons.items())
+    assert [line.count(str(tmp_path)) for line in result.err.splitlines() if "/one.png" in line] == [1]
     assert result.err.count("failed:") == len(reasons)
     assert list(samples_of(tmp_path / "out.mcap")) == ["a/good.png"]
 

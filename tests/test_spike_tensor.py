@@ -100,6 +100,22 @@ def test_a_seed_gives_the_same_network_and_another_seed_another(animals):
 
 
 @with_torch
+def test_of_many_samples_some_are_drawn_by_the_seed(animals, monkeypatch):
+    from streamfeat.evaluate import spike_tensor
+
+    monkeypatch.setattr(spike_tensor, "_MOST_SAMPLES", 7)
+    steps, seen = spike_tensor.spike_steps, []
+    monkeypatch.setattr(spike_tensor, "spike_steps", lambda *a: seen.append(a[3].sum()) or steps(*a))
+    drawn = []
+    for seed in (0, 0, 1):
+        seen.clear()
+        trained(animals, epochs=1, seed=seed)
+        drawn.append([*seen])
+    assert [len(one) for one in drawn] == [7, 7, 7]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+@with_torch
 def test_features_of_a_window(animals):
     made = trained_once()
     events = tiny.steady(1000, 90_000, 300)

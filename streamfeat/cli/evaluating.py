@@ -223,8 +223,8 @@ def evaluate(
             data = DataSet(recordings, topic, folds, Trial(**base).seed, on, groups, reading)
             print_assumptions(data.assumptions)
             report("reading labels", 1, 1, "")
-            if not WITHOUT_KERNELS.issuperset(methods):
-                compile_first([True], quiet=quiet)
+            kinds = {"lasso" if method == "inverse" else "narrow" for method in {*methods} - WITHOUT_KERNELS}
+            compile_first(kinds, quiet=quiet)
             result = run(
                 data,
                 plan_cells(methods, base, parsed, data.n_folds),

@@ -253,6 +253,7 @@ def train(
     from streamfeat.classify.variants import parse_cuts, variants_of
     from streamfeat.engine.encoder import Encoder
     from streamfeat.recordings.reader import open_recording
+    from streamfeat.stream.compiling import state_of
 
     refuse_existing(classifier, *recordings, model, overwrite=overwrite)
     if (select is None) != (selected_model is None):
@@ -274,7 +275,7 @@ def train(
                     f"{rec.path}: has no labelled samples; give them with --labels FILE.csv, "
                     "or write them with `streamfeat convert`"
                 )
-        compile_first([encoder.is_narrow], quiet=quiet)
+        compile_first([state_of(encoder)], quiet=quiet)
         place = files.enter_context(working(cluster, workers, quiet=quiet))
         report = files.enter_context(progress_bars(quiet=quiet, as_lines=verbose))
         samples = encode_recordings(encoder, opened, report, workers=place)

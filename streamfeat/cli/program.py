@@ -252,25 +252,25 @@ def model_or_general(model: Path | None) -> Path:
     return model or GENERAL_MODEL
 
 
-def compile_first(states: Iterable[bool], *, quiet: bool) -> None:
-    """Compile the kernels that every encoder needs, on two cores; nothing where that was done before.
+def compile_first(states: Iterable[str], *, quiet: bool) -> None:
+    """Compile the kernels that encoders need, on two cores; nothing where that was done before.
 
     Args:
-        states: of the encoders, True for the narrow one.
+        states: kinds of state of the encoders, see `compiling.state_of`.
         quiet: say nothing.
     """
     from streamfeat.stream.compiling import compile_together
 
     tell_compiling(quiet=quiet)
-    for narrow in sorted(set(states)):
-        compile_together(narrow=narrow)
+    for state in sorted(set(states)):
+        compile_together(state)
 
 
 def tell_compiling(*, quiet: bool) -> None:
     """Say why nothing else is said for half a minute, where kernels were not compiled before."""
-    from streamfeat.stream.compiling import is_compiled
+    from streamfeat.stream.compiling import STATES, is_compiled
 
-    if not quiet and not (is_compiled(narrow=True) or is_compiled(narrow=False)):
+    if not quiet and not any(is_compiled(state) for state in STATES):
         err.print(
             "[dim]compiling:[/] kernels, once for this version; it takes half a minute or more",
             soft_wrap=True,

@@ -6,7 +6,7 @@ Not here: the simulation (`simulate`, `convert.simulation`).
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, cast
 
 import typer
 
@@ -53,8 +53,8 @@ def simulate(
         str,
         typer.Option(
             help="crop: the sensor never sees the border of an image (N-Caltech101); black: all around is "
-            "black (N-MNIST).",
-            autocompletion=completing("crop", "black"),
+            "black; edge: all around is as its border (N-MNIST: dark digits on white).",
+            autocompletion=completing("crop", "black", "edge"),
         ),
     ] = "crop",
     amplitude: Annotated[float, typer.Option(help="Pixels that images move to each side.")] = 3.5,
@@ -121,7 +121,7 @@ def simulate(
             bandwidth_hz,
         ),
         amplitude,
-        cast(Literal["crop", "black"], border),
+        cast(simulation.Border, border),
         gamma,
         seed,
     )

@@ -8,6 +8,7 @@ Not here: what is written (`export`), and MCAP itself (`streamfeat.recordings.wr
 import contextlib
 import tempfile
 import zipfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Literal, Protocol
@@ -58,7 +59,7 @@ class Output(Protocol):
         """Write the rest; call it last."""
 
 
-class _OneSensor:
+class _OneSensor(ABC):
     """The common part of formats that hold one sensor and no labels.
 
     Where `needs_order` is set, events are put in order of time within `HELD_US`.
@@ -107,7 +108,7 @@ class _OneSensor:
             self._written_us = int(ready["t"][-1])
             self.add(ready)
 
-    def label(self, label: Label) -> None:
+    def label(self, label: Label) -> None:  # noqa: B027  (of some formats only)
         """See `Output.label`."""
 
     def finish(self) -> None:
@@ -115,17 +116,17 @@ class _OneSensor:
         self._release(_NEVER_US)
         self.end()
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (of some formats only)
         """Let go of what is open besides the file, however it ended."""
 
-    def begin(self, resolution: Resolution) -> None:
+    def begin(self, resolution: Resolution) -> None:  # noqa: B027  (of some formats only)
         """Write what stands before the first events."""
 
+    @abstractmethod
     def add(self, events: Events) -> None:
         """Write events, at least one."""
-        raise NotImplementedError
 
-    def end(self) -> None:
+    def end(self) -> None:  # noqa: B027  (of some formats only)
         """Write what stands behind the last events."""
 
 

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -29,7 +29,9 @@ from streamfeat.simulate.saccades import Saccades, simulate_saccades
 from streamfeat.work.workers import THIS_PROCESS, Workers
 
 __all__ = [
+    "BORDERS",
     "MONITOR_CAMERA",
+    "Border",
     "Scene",
     "is_image_folder",
     "simulate_film",
@@ -40,6 +42,9 @@ __all__ = [
 MONITOR_CAMERA = CameraModel(resolution=(180, 240), threshold=0.28)
 """The camera of N-Caltech101. Its threshold is the one parameter that was chosen by measurement: with it
 images of faces give as many events as the real sample of one (tools/compare_simulation.py)."""
+
+Border = Literal["crop", "black", "edge"]
+BORDERS: tuple[str, ...] = get_args(Border)
 
 _NOTHING = Measured((), (1, 1), 0, 0, 0)
 _CHUNK_US = 1_000_000
@@ -57,7 +62,8 @@ class Scene:
         border: `crop`: the image is as large as fits, and the sensor as large as the part of it that never
             leaves the view, so that no border is ever seen, as in N-Caltech101, whose one sample here is 7
             pixels smaller than its image. `black`: the sensor has its whole resolution, the image is as large
-            as fits at any moment, and all around is black, as in N-MNIST.
+            as fits at any moment, and all around is black. `edge`: the same, but all around is as the image's
+            border, as in N-MNIST, whose digits are dark on a bright screen.
         gamma: exponent from what an image says to its light on a monitor.
         seed: of the background noise; that of the sensor's mismatch is the camera's.
 
@@ -67,14 +73,14 @@ class Scene:
 
     camera: CameraModel = MONITOR_CAMERA
     amplitude_px: float = 3.5
-    border: Literal["crop", "black"] = "crop"
+    border: Border = "crop"
     gamma: float = 2.2
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what makes no sense."""
-        if self.border not in ("crop", "black"):
-            raise InputError(f"--border {self.border} is unknown; choose crop or black")
+        if self.border not in BORDERS:
+            raise InputError(f"--border {self.border} is unknown; choose from {', '.join(BORDERS)}")
         if not 0 < self.amplitude_px <= 100:
             raise InputError(
                 f"--amplitude {self.amplitude_px:g} is not possible; give pixels, from above 0 to 100"
@@ -220,11 +226,13 @@ def simulated_image(path: Path, source: str, scene: Scene) -> tuple[Events, Reso
                 f"{path}: is {columns}x{rows} pixels on the sensor, too narrow to move by {margin}; "
                 "--border black shows all of it"
             )
+    if scene.border != "black" and np.ptp(picture) == 0:
+        raise InputError(f"{path}: is all of one grey; nothing changes where it moves")
     amplitude = scene.amplitude_px, scene.amplitude_px
     saccades = Saccades(image_px=max(rows, columns), amplitude_px=amplitude)
     rng = np.random.default_rng([scene.seed, zlib.crc32(source.encode())])
     camera = replace(scene.camera, resolution=full)
-    events = simulate_saccades(picture, rng, camera, saccades, goes_on=scene.border == "crop")
+    events = simulate_saccades(picture, rng, camera, saccades, goes_on=scene.border != "black")
     if not len(events):
         raise InputError(f"{path}: gives no events; is it all of one grey?")
     return events, full

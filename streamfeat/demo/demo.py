@@ -71,7 +71,7 @@ class Demo:
     @contextmanager
     def compiling(self) -> Iterator[None]:
         """Compile on other cores while the block runs, into numba's cache, where `compile` finds it."""
-        with Compilers(narrow=True) as self._compilers:
+        with Compilers("narrow") as self._compilers:
             yield
 
     def simulate(self) -> int:

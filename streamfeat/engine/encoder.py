@@ -211,7 +211,7 @@ class Encoder(Shown):
         """SHA-256 over everything that decides what features are."""
         digest = hashlib.sha256(repr((self.geometry, self.encoding, self.formulation)).encode())
         for name, value in zip(Operator._fields, self.operator, strict=True):
-            if name in ("shape", "packed", "wide", "upper", "lower", "gain"):
+            if name in ("shape", "packed", "wide", "lasso", "upper", "lower", "gain"):
                 continue  # of the sensor, columns again, or of the narrow state alone
             if name == "steps" and value is None:
                 continue  # of the narrow state, too
@@ -329,8 +329,7 @@ class Encoder(Shown):
         if not all(math.isfinite(value) for value in scalars.values()):
             raise InputError("a scalar is not finite")
         fields = fixed_fields(geometry, formulation, encoding, threshold, filters) | scalars
-        narrow = "steps" in arrays
-        stored, fields["wide"] = _stored_arrays(narrow=narrow), None if narrow else True
+        stored = _stored_arrays(narrow="steps" in arrays)
         operator = Operator(**fields, **{name: cast(Any, arrays[name]) for name in stored})
         provenance = header.get("provenance", {})
         if not isinstance(provenance, dict):

@@ -129,7 +129,6 @@ def quantise(
         reach=reach,
         square_norms=square_norms,
         gap=float(gap),
-        wide=None if narrow else True,
         steps=steps,
     )
 
@@ -147,7 +146,7 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
     """Refuse an operator whose arrays do not fit, or whose integers could overflow.
 
     Returns:
-        the operator, with `largest` filled in.
+        the operator, with `largest` filled in, and the kind of state that it needs.
 
     Raises:
         InputError: with the arithmetic.
@@ -190,10 +189,11 @@ def check_operator(geometry: Geometry, operator: Operator) -> Operator:
     columns = aligned_zeros(operator.columns.shape, np.int16)
     columns[:] = operator.columns
     packed = operator.packed if form[0] else _in_pairs(columns)
-    checked = operator._replace(columns=columns, packed=packed)
+    checked = operator._replace(columns=columns, packed=packed, wide=None)
     if operator.steps is not None:
         return checked
-    checked = checked._replace(largest=_largest_code(checked))
+    lasso, wide = (True, None) if operator.inverse else (None, True)
+    checked = checked._replace(largest=_largest_code(checked), lasso=lasso, wide=wide)
     _fixed_point_bits(checked, 1)
     return checked
 

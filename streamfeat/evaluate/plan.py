@@ -33,7 +33,7 @@ METHODS = {
     "random": "random filters",
     "model": "a model that was learned before, the general one that ships without -m",
     "hats": "HATS, averaged time surfaces",
-    "hots": "HOTS, one layer of time surfaces",
+    "hots": "HOTS, three layers of time surfaces",
     "dart": "DART, words of log-polar descriptors",
     "est": "EST, a learned kernel on spikes and a small network trained from nothing, with labels",
     "hfirst": "HFirst, first spikes of oriented neurons",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from streamfeat.errors import InputError
-from streamfeat.evaluate.samples import downsampled, training_samples, until
+from streamfeat.evaluate.samples import downsampled, some_training_samples, until
 from streamfeat.events import Events, Resolution
 from streamfeat.recordings.reader import Recording
 
@@ -34,7 +34,7 @@ _MOST_EVENTS = 30_000
 """Of a sample, evenly drawn: what a sample may take of memory and time."""
 
 _MOST_SAMPLES = 20_000
-"""To learn from, evenly drawn."""
+"""To learn from."""
 
 _BATCH = 16
 _HIDDEN = 30
@@ -107,13 +107,11 @@ class SpikeTensor:
             InputError: there is no event, or there are fewer than two classes.
         """
         steps, labels = [], []
-        n_samples = sum(len(recording.labels) for recording in recordings)
-        every = max(1, -(-n_samples // _MOST_SAMPLES))
-        for i, sample in enumerate(training_samples(recordings)):
-            if i % every == 0:
-                small, resolution = downsampled(sample.events, sample.resolution, downsample)
-                steps.append(spike_steps(*until(small, resolution), resolution, bins, grid))
-                labels.append(sample.label.label)
+        _, samples = some_training_samples(recordings, _MOST_SAMPLES, np.random.default_rng([seed, 1]))
+        for sample in samples:
+            small, resolution = downsampled(sample.events, sample.resolution, downsample)
+            steps.append(spike_steps(*until(small, resolution), resolution, bins, grid))
+            labels.append(sample.label.label)
         names = sorted(set(labels))
         if len(names) < 2 or not sum(map(len, steps)):
             raise InputError(

@@ -4,6 +4,7 @@ Lives here: Gabor filters, and both networks as maps from the events of a sample
 Not here: methods of time surfaces (`surfaces`), and the loops over events (`kernels.spiking`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -45,7 +46,7 @@ def gabor_filters(side: int = 7, n_orientations: int = 12) -> NDArray[np.float64
     return scaled
 
 
-class _GridOfSpikes:
+class _GridOfSpikes(ABC):
     """Spikes of each orientation, counted on a grid as large as the sample.
 
     Args of the constructors of its kinds: rows and columns of the grid, and sensor pixels along each side
@@ -90,9 +91,9 @@ class _GridOfSpikes:
 
         return count
 
+    @abstractmethod
     def state(self, resolution: Resolution) -> tuple[Callable[[IntArray], NDArray[Any]], tuple[Any, ...]]:
         """From microseconds to the kernel's time, and all that it takes after the events; counts are last."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,6 +119,7 @@ def move_volume(plane: int, volume: int, n: int, part: int, operator: Operator, 
 def follow_changes(
     narrow: NDArray[np.uint16] | None,
     wide: bool | None,
+    lasso: bool | None,
     plane: int,
     volume: int,
     n: int,
@@ -128,7 +129,7 @@ def follow_changes(
 ) -> None:
     """Let listed entries of a volume change, in the shortest way.
 
-    Args: as for `change_volume`, after the states (see `encode.write_code`). In the narrow state the
+    Args: as for `change_volume`, after the kinds of state (see `encode.write_code`). In the narrow state the
         volume may wait in the queue: `follow_rest` has to be called behind the last.
     """
     squares = state.moments[plane, volume, MOMENT_SQUARES]
@@ -140,8 +141,9 @@ def follow_changes(
     if narrow is not None:  # noqa: SIM102 - see `encode.write_code`
         if closed:
             queue_volume(plane, volume, n, part, operator, state)
-    if wide is not None:
-        closed = closed and not operator.inverse
+    if lasso is not None:
+        closed = False
+    if wide is not None:  # noqa: SIM102 - see `encode.write_code`
         if closed:
             move_volume(plane, volume, n, part, operator, state)
     if not closed:
@@ -175,6 +177,7 @@ def change_place(position: int, row: int, column: int, operator: Operator, state
     """
     n_bins, patch, limit = state.counts.shape[0], operator.patch, operator.max_count
     height, width = patch
+    kinds = operator.upper, operator.wide, operator.lasso
     values = state.values[0, 0]
     slot = slot_of(position, state)
     before = np.int64(state.applied[slot, row, column])
@@ -204,6 +207,6 @@ def change_place(position: int, row: int, column: int, operator: Operator, state
                     values[end:] = 0
                 values[entry] = before
                 state.entries[0, 0], state.changes[0, 0] = entry, after - before
-                follow_changes(operator.upper, operator.wide, plane, volume, ONCE, NO_THREAD, operator, state)
+                follow_changes(*kinds, plane, volume, ONCE, NO_THREAD, operator, state)
     follow_rest(operator.upper, NO_THREAD, operator, state)
     state.applied[slot, row, column] = after

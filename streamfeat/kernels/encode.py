@@ -52,13 +52,15 @@ def encode_volume(
             atoms[:] = 0
         code[:] = 0
         return
-    write_code(operator.upper, operator.wide, projection, moments, atoms, fresh, part, operator, state)
+    kinds = operator.upper, operator.wide, operator.lasso
+    write_code(*kinds, projection, moments, atoms, fresh, part, operator, state)
 
 
 @inlined
 def write_code(
     narrow: NDArray[np.uint16] | None,
     wide: bool | None,
+    lasso: bool | None,
     projection: NDArray[np.int32] | NDArray[np.int16],
     moments: NDArray[np.int64],
     atoms: NDArray[np.float64],
@@ -69,24 +71,26 @@ def write_code(
 ) -> None:
     """Write the code of a volume that is not empty.
 
-    Args: as for `encode_volume`, after `operator.upper` and `operator.wide`, one of which is None: numba
-        forgets what would be done if it was not, so that each state compiles the code of its own only.
+    Args: as for `encode_volume`, after `operator.upper`, `operator.wide` and `operator.lasso`, all but one
+        of which are None: numba forgets what would be done if they were not, so that each kind of state
+        compiles the code of its own only.
     """
     code = state.code[part, 0]
     if narrow is not None:
         narrow_code(narrow_gain(moments, operator), projection, operator.upper, operator.lower, code)
     if wide is not None:
         sigma = deviation(moments, operator.columns.shape[0], operator.eps)
-        if operator.inverse:
-            if fresh:
-                square = whitened_square(moments, sigma, operator)
-                work, active, corners = state.work[part], state.active[part], state.corners[part]
-                lasso_code(projection, sigma, square, operator, atoms, work, active, corners)
-            fix_atoms(atoms[CODE], operator, code)
-        elif operator.kind == TRIANGLE:
+        if operator.kind == TRIANGLE:
             triangle_code(projection, sigma, whitened_square(moments, sigma, operator), operator, code)
         else:
             soft_code(projection, sigma, operator, code)
+    if lasso is not None:
+        if fresh:
+            sigma = deviation(moments, operator.columns.shape[0], operator.eps)
+            square = whitened_square(moments, sigma, operator)
+            work, active, corners = state.work[part], state.active[part], state.corners[part]
+            lasso_code(projection, sigma, square, operator, atoms, work, active, corners)
+        fix_atoms(atoms[CODE], operator, code)
 
 
 @kernel
@@ -108,13 +112,15 @@ def pool_volume(
         state.encoded[part] += 1
     cell = state.cells[volume]
     sums = state.pooled[plane, cell] if part == 0 else state.partial[part - 1, plane, cell]
-    pool_row_of(operator.upper, operator.wide, plane, row, sign, part, operator, state, sums)
+    kinds = operator.upper, operator.wide, operator.lasso
+    pool_row_of(*kinds, plane, row, sign, part, operator, state, sums)
 
 
 @inlined
 def pool_row_of(
     narrow: NDArray[np.uint16] | None,
     wide: bool | None,
+    lasso: bool | None,
     plane: int,
     row: int,
     sign: int,
@@ -125,7 +131,7 @@ def pool_row_of(
 ) -> None:
     """Encode a row of a plane, and add it to the sums of its cell or take it away.
 
-    Args: as for `pool_volume`, after the states (see `write_code`) and before the sums of the cell.
+    Args: as for `pool_volume`, after the kinds of state (see `write_code`) and before the sums of the cell.
     """
     projection, moments = state.projections[plane, row], state.moments[plane, row]
     atoms, fresh = state.atoms[plane, row], sign == ADD
@@ -133,8 +139,12 @@ def pool_row_of(
         if moments[MOMENT_SQUARES] != 0:
             factors = narrow_gain(moments, operator)
             pool_narrow(sign, factors, projection, operator.upper, operator.lower, sums)
+    if lasso is not None:
+        encode_volume(projection, moments, atoms, fresh, part, operator, state)
+        if moments[MOMENT_SQUARES] != 0:
+            pool(state.code[part, 0], sign, operator.kind, sums)
     if wide is not None:
-        if operator.inverse or operator.kind == TRIANGLE or moments[MOMENT_SQUARES] == 0:
+        if operator.kind == TRIANGLE or moments[MOMENT_SQUARES] == 0:
             encode_volume(projection, moments, atoms, fresh, part, operator, state)
             if moments[MOMENT_SQUARES] != 0:
                 pool(state.code[part, 0], sign, operator.kind, sums)
@@ -156,7 +166,7 @@ def read_cell(cell: int, operator: Operator, state: State, features: NDArray[np.
     """
     pooled, size = state.pooled[state.clock[CLOCK_PLANE]], features.shape[0] // state.pooled.shape[1]
     own, place = pooled[cell : cell + 1], features[cell * size : (cell + 1) * size]
-    write_features(operator.steps, operator.wide, operator, own, place)
+    write_features(operator.steps, operator, own, place)
 
 
 @kernel
@@ -169,13 +179,12 @@ def read_features(operator: Operator, state: State, features: NDArray[np.float32
         features: `(cells * K,)`, or `(cells * 2 K,)` for SPLIT, in each cell positive parts before negative
             ones; overwritten.
     """
-    write_features(operator.steps, operator.wide, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
+    write_features(operator.steps, operator, state.pooled[state.clock[CLOCK_PLANE]], features)
 
 
 @inlined
 def write_features(
     steps: NDArray[np.float64] | None,
-    wide: bool | None,
     operator: Operator,
     pooled: NDArray[np.int32],
     features: NDArray[np.float32],
@@ -183,8 +192,7 @@ def write_features(
     """Write pooled sums of the cells as floats.
 
     Args:
-        steps: of the operator.
-        wide: of the operator (see `write_code`).
+        steps: of the operator (see `write_code`).
         operator: number of filters, encoding and fixed point.
         pooled: `(cells, F)`.
         features: as for `read_features`.
@@ -200,7 +208,7 @@ def write_features(
             if split:
                 for k in range(n):
                     first[n + k] = np.float32(other[k] * steps[k])
-        if wide is not None:
+        else:
             if split:
                 for k in range(n):
                     first[k] = np.float32((np.int64(other[k]) + one[k]) // 2 * per_unit)

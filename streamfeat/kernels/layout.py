@@ -75,8 +75,10 @@ class Operator(NamedTuple):
     shape: tuple[int, int] = (0, 0)
     """Rows and columns of the grid of volumes; of the sensor, not of the model, which has none."""
     wide: bool | None = True
-    """None in the narrow state, as `steps`, `upper` and `lower` are in the wide one: a kernel is compiled
-    for the state that it is called with, and for no other."""
+    """True in the wide state of codes in closed form, None in the others, as `steps`, `upper` and `lower` are
+    but in the narrow one: a kernel is compiled for the kind of state that it is called with, for no other."""
+    lasso: bool | None = None
+    """True where `inverse` is, or else None."""
     steps: NDArray[np.float64] | None = None
     """`(Kp,)`: `P[k] = steps[k] * columns[:, k]` in the narrow state, where `scale` means nothing; of a
     sensor, what a code of one is worth."""

@@ -100,20 +100,21 @@ def project_volume(
 
 
 @inlined
-def enter_atoms(wide: bool | None, plane: int, row: int, part: int, operator: Operator, state: State) -> None:
+def enter_atoms(
+    lasso: bool | None, plane: int, row: int, part: int, operator: Operator, state: State
+) -> None:
     """Let the lasso of a volume start from the code that is kept of it.
 
     Args:
-        wide: of the operator (see `encode.write_code`).
+        lasso: of the operator (see `encode.write_code`).
         plane: which plane.
         row: of the volume.
         part: whose scratch to use.
         operator: the encoder.
         state: `atoms` and scratch are changed.
     """
-    if wide is not None:  # noqa: SIM102 - see `encode.write_code`
-        if operator.inverse:
-            respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
+    if lasso is not None:
+        respond(operator.gram, state.atoms[plane, row], state.work[part], state.active[part])
 
 
 @kernel
@@ -134,7 +135,7 @@ def enter_code(plane: int, volume: int, part: int, operator: Operator, state: St
     if state.moments[plane, row, MOMENT_SQUARES] == 0:
         state.atoms[plane, row] = 0
         return False
-    enter_atoms(operator.wide, plane, row, part, operator, state)
+    enter_atoms(operator.lasso, plane, row, part, operator, state)
     pool_volume(plane, row, volume, ADD, part, operator, state)
     return True
 

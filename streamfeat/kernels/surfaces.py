@@ -66,16 +66,16 @@ def time_surfaces(
     Args:
         x: `(n,)` column of each event, in order of time, as the other three; none is changed.
         y: `(n,)` row.
-        p: `(n,)` 0 or 1.
+        p: `(n,)` from 0 to P - 1; P is 2 for events of a camera, and in later layers the prototypes before.
         t: `(n,)` time since the start of the sample, in units of `tau`.
-        latest: `(2, H + 2 R, W + 2 R)` time of the latest event of each polarity and pixel, with a margin of
+        latest: `(P, H + 2 R, W + 2 R)` time of the latest event of each polarity and pixel, with a margin of
             `R` pixels; -inf where there was none; changed.
-        out: `(n, 2, 2 R + 1, 2 R + 1)`; changed.
+        out: `(n, P, 2 R + 1, 2 R + 1)`; changed.
     """
     side = out.shape[2]
     for i in range(len(t)):
         latest[p[i], y[i] + side // 2, x[i] + side // 2] = t[i]
-        for polarity in range(2):
+        for polarity in range(out.shape[1]):
             for row in range(side):
                 for column in range(side):
                     age = t[i] - latest[polarity, y[i] + row, x[i] + column]

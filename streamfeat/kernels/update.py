@@ -111,6 +111,7 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
     """
     n_bins, patch, columns = state.counts.shape[0], operator.patch, operator.shape[1]
     area = patch[0] * patch[1]
+    kinds = operator.upper, operator.wide, operator.lasso
     values, news, n_volumes = state.values[part, 0], state.values[part, 1], operator.shape[0] * columns
     first_bin, last_bin = touched_bins(state)
     first, last = share_of(part, parts, state)
@@ -135,7 +136,7 @@ def renew(part: int, parts: int, operator: Operator, state: State) -> None:
         else:
             gather_volume(state.applied, slot, start, stop, top, left, patch, values)
         n = list_entries(news, start, stop, state.entries[part], state.changes[part])
-        follow_changes(operator.upper, operator.wide, plane, volume, n, part, operator, state)
+        follow_changes(*kinds, plane, volume, n, part, operator, state)
     follow_rest(operator.upper, part, operator, state)
 
 

@@ -26,6 +26,7 @@ from streamfeat.latency.update import Walk, call_each, feed_and_read, walk
 from streamfeat.recordings.options import AS_IT_IS, ReadOptions
 from streamfeat.recordings.reader import Label, Packet, Recording, open_recording
 from streamfeat.report.machine import Disturbance, describe_machine
+from streamfeat.stream.compiling import state_of
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.replay import items_of_split
 
@@ -152,9 +153,9 @@ class LatencyReport:
         self.preemptions = 0
 
     @property
-    def states(self) -> list[bool]:
-        """Of each model, whether its engines have the narrow state."""
-        return [model.encoder.is_narrow for model in self._models]
+    def states(self) -> list[str]:
+        """The kind of state that engines of each model have, see `compiling.state_of`."""
+        return [state_of(model.encoder) for model in self._models]
 
     def compile(self) -> None:
         """Let numba compile what `run` will call, and measure what reading the clock costs."""

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from streamfeat.errors import InputError
 from streamfeat.evaluate.retina import RetinalWords
 from streamfeat.evaluate.spiking import FirstSpikes, LeakySpikes
-from streamfeat.evaluate.surfaces import AveragedSurfaces, CountImage, SurfaceHistogram
+from streamfeat.evaluate.surfaces import (
+    HOTS_LAYERS,
+    AveragedSurfaces,
+    CountImage,
+    SurfaceHistogram,
+    SurfaceLayer,
+)
 from streamfeat.events import Events, Resolution, is_valid
 from streamfeat.kernels.retina import describe_events
 from streamfeat.kernels.spiking import spike_first, spike_leaky
@@ -27,10 +33,9 @@ from streamfeat.kernels.surfaces import add_memory_surfaces, time_surfaces
 from streamfeat.latency.stopwatch import Stamps, now
 from streamfeat.recordings.reader import Label, Packet
 
-__all__ = ["TIMED", "Live", "Method", "any_prototypes", "any_words", "walk_method"]
+__all__ = ["TIMED", "Live", "Method", "any_layers", "any_words", "walk_method"]
 
 _CHUNK = 256
-_PROTOTYPES = 64
 _WORDS = 500
 
 Columns = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
@@ -124,25 +129,27 @@ def _hats(resolution: Resolution) -> Live:
     return Live(timed, lambda: (sums / np.maximum(counts, 1)[:, :, None, None, None]).ravel())
 
 
-def any_prototypes() -> NDArray[np.float32]:
+def any_layers() -> SurfaceHistogram:
     """Prototypes for HOTS: which they are does not change what it costs to find the nearest."""
-    return np.random.default_rng(0).random((_PROTOTYPES, 2 * 7 * 7)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    sizes = ((n, n_in * (2 * radius + 1) ** 2, radius, tau_us) for n, n_in, radius, tau_us in HOTS_LAYERS)
+    made = (SurfaceLayer(rng.random((n, d), np.float32), radius, tau_us) for n, d, radius, tau_us in sizes)
+    return SurfaceHistogram(tuple(made))
 
 
 def _hots(resolution: Resolution) -> Live:
-    side = 7
-    features = SurfaceHistogram(any_prototypes())
-    prototypes = features.prototypes
-    half = np.square(prototypes).sum(axis=1) / np.float32(2)
-    latest = np.full((2, resolution[0] + side - 1, resolution[1] + side - 1), -np.inf)
-    surface, counts = np.empty((1, 2, side, side), np.float32), np.zeros((4, _PROTOTYPES), np.int64)
-
-    def timed(columns: Columns) -> Stamps:
-        x, y, p, t = columns
-        of_state = latest, surface, surface.reshape(-1), prototypes, half, *resolution, counts
-        return _told(_walk_hots, x, y, p, t / features.tau_us, *of_state)
-
-    return Live(timed, counts.ravel)
+    layers = any_layers().layers
+    surfaces = tuple(np.empty((1, one.n_polarities, one.side, one.side), np.float32) for one in layers)
+    counts = np.zeros((4, len(layers[-1].prototypes)), np.int64)
+    state = (
+        tuple(one.tau_us for one in layers),
+        tuple(one.blank(resolution) for one in layers),
+        surfaces,
+        tuple(surface.reshape(-1) for surface in surfaces),
+        tuple(one.prototypes for one in layers),
+        tuple(one.half_squares for one in layers),
+    )
+    return Live(lambda columns: _told(_walk_hots, *columns, *state, *resolution, counts), counts.ravel)
 
 
 def any_words() -> NDArray[np.float32]:
@@ -209,14 +216,18 @@ def _nearest(flat, prototypes, half):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _walk_hots(  # type: ignore[no-untyped-def]
-    x, y, p, t, latest, surface, flat, prototypes, half, height, width, counts, timespec, stamps
+    x, y, p, t, taus, latest, surfaces, flat, prototypes, half, height, width, counts, timespec, stamps
 ):
+    polarity, time = np.empty(1, np.int64), np.empty(1)
     stamps[0] = now(timespec)
     for i in range(len(x)):
         j = i + 1
-        time_surfaces(x[i:j], y[i:j], p[i:j], t[i:j], latest, surface)
-        best = _nearest(flat, prototypes, half)
-        counts[2 * (2 * y[i] >= height) + (2 * x[i] >= width), best] += 1
+        polarity[0] = p[i]
+        for k in range(len(latest)):
+            time[0] = t[i] / taus[k]
+            time_surfaces(x[i:j], y[i:j], polarity, time, latest[k], surfaces[k])
+            polarity[0] = _nearest(flat[k], prototypes[k], half[k])
+        counts[2 * (2 * y[i] >= height) + (2 * x[i] >= width), polarity[0]] += 1
         stamps[j] = now(timespec)
 
 
@@ -283,7 +294,7 @@ def _walk_counts(x, y, p, height, width, counts, timespec, stamps):  # type: ign
 
 TIMED: dict[str, tuple[str, Callable[[Resolution], Live]]] = {
     "hats": ("HATS, surfaces of 7x7 summed in cells of 10x10", _hats),
-    "hots": (f"HOTS, one layer, {_PROTOTYPES} prototypes of 2x7x7, by plain loops", _hots),
+    "hots": ("HOTS, layers of 4, 8 and 16 prototypes of 2x5x5, 4x9x9 and 8x17x17, by plain loops", _hots),
     "dart": (f"DART, {_WORDS} words of 7x12, 2,000 events remembered, by plain loops", _dart),
     "hfirst": ("HFirst, layers S1 and C1, 12 orientations of 7x7", _spikes(_walk_first, FirstSpikes())),
     "gabor-snn": ("Gabor-SNN, 12 orientations of 7x7", _spikes(_walk_leaky, LeakySpikes())),

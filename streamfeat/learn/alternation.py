@@ -4,6 +4,7 @@ Lives here: `Alternation`, which starts, records, stops, is interrupted and goes
 Not here: the half-steps themselves (`transform`, `dictionary`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
@@ -32,7 +33,7 @@ class Step(NamedTuple):
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
-class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+class Alternation(TransformerMixin, BaseEstimator, ABC):  # type: ignore[misc]
     """Alternating minimisation over codes and the `(K, d)` rows of a transform or dictionary.
 
     The rows are float32 from one iteration to the next, so that learning goes on from saved rows with the
@@ -159,10 +160,11 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(self.components_, np.float32)
 
     @property
+    @abstractmethod
     def _n_rows(self) -> int:
         """`K`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _alternate(
         self, volumes: ChunkedVolumes, squares: NDArray[np.float64], rows: NDArray[np.float32]
     ) -> Iterator[Step]:
@@ -173,7 +175,6 @@ class Alternation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             squares: `(n,)` their squared lengths.
             rows: `(K, d)` to start from.
         """
-        raise NotImplementedError
 
     def __sklearn_tags__(self) -> Any:
         """Say that codes are float32 whatever goes in."""

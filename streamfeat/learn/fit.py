@@ -165,7 +165,7 @@ def _sample(
     if len(volumes.keys) == 0:
         raise InputError(
             f"no local volume of {geometry.sides[0]}x{geometry.sides[1]} pixels with an event was found in "
-            f"{volumes.windows} windows; check the recording's resolution and splits"
+            f"{volumes.windows} windows; check resolution and splits, or give a smaller --patch, or sensor"
         )
     return volumes
 

@@ -59,7 +59,7 @@ class FrameFolder:
         self.n_frames = len(self._frames)
         if self.n_frames < 2:
             raise InputError(
-                f"{folder}: has {self.n_frames} images right inside; a film needs two, and a data set has "
+                f"{folder}: a film needs two images right inside, this has {self.n_frames}; a data set has "
                 "folders LABEL/IMAGE"
             )
         self._box = box or (1 << 14, 1 << 14)

@@ -56,6 +56,8 @@ def load_picture(path: Path, box: Resolution, *, enlarge: bool = True) -> NDArra
             grey = _grey(image, path)
     except Image.DecompressionBombError as error:
         raise InputError(f"{path}: is too large: {error}") from None
+    except InputError:  # is a ValueError, and has its line already
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: does not exist, or is a link that leads nowhere") from None
     # What Pillow raises for damaged files of one kind or another.

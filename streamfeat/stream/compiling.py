@@ -22,6 +22,7 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
+from streamfeat.engine.encoder import Encoder, Formulation
 from streamfeat.engine.geometry import Geometry
 from streamfeat.engine.operator import n_features, with_fixed_point
 from streamfeat.engine.random_encoder import random_encoder
@@ -35,7 +36,10 @@ from streamfeat.kernels.ingest import count_events
 from streamfeat.kernels.update import mark_dirty, read, renew, settle
 from streamfeat.work.interrupts import at_leaving
 
-__all__ = ["Compilers", "compile_together", "is_compiled"]
+__all__ = ["STATES", "Compilers", "compile_together", "is_compiled", "state_of"]
+
+STATES = "narrow", "wide", "lasso"
+"""Kinds of state, which kernels are compiled for: of 16 bits, of 32, and of the inverse formulation."""
 
 _TURN_S = 0.05
 _PATIENCE_S = 300
@@ -44,13 +48,16 @@ _PATIENCE_S = 300
 _FIRST, _ALONE = 0, 1
 
 
-def is_compiled(*, narrow: bool) -> bool:
-    """Whether the kernels of a state are in the cache, or nothing can be kept there.
+def state_of(encoder: Encoder) -> str:
+    """The kind of state that engines of an encoder have, one of `STATES`."""
+    if encoder.is_narrow:
+        return "narrow"
+    return "lasso" if encoder.operator.inverse else "wide"
 
-    Args:
-        narrow: the narrow state of engines, or the wide one.
-    """
-    mark = _mark(narrow)
+
+def is_compiled(state: str) -> bool:
+    """Whether the kernels of a kind of state are in the cache, or nothing can be kept there."""
+    mark = _mark(state)
     return mark is None or mark.exists()
 
 
@@ -60,19 +67,19 @@ class Compilers:
     On a single core it is none: two would do parts of their work twice. They get no SIGINT from the terminal.
 
     Args:
-        narrow: which state of engines to compile for.
+        state: the kind to compile for, one of `STATES`.
     """
 
-    def __init__(self, *, narrow: bool) -> None:
+    def __init__(self, state: str) -> None:
         """Start them, if there is something to compile and no other command does."""
-        self._narrow, self._until_s = narrow, time.monotonic() + _PATIENCE_S
+        self._state, self._until_s = state, time.monotonic() + _PATIENCE_S
         self._started: list[subprocess.Popen[bytes]] = []
         self._lock: BinaryIO | None = None
         self._others_compile = False
         self._begin()
 
     def _begin(self) -> None:
-        mark = _mark(self._narrow)
+        mark = _mark(self._state)
         self._others_compile = False
         if mark is None or mark.exists() or _cores() < 2 or not sys.executable:
             return
@@ -93,7 +100,7 @@ class Compilers:
             raise
 
     def _start(self, half: str, stdin: object = None, stdout: object = None) -> "subprocess.Popen[bytes]":
-        command = [sys.executable, "-P", "-m", __name__, half, "narrow" if self._narrow else "wide"]
+        command = [sys.executable, "-P", "-m", __name__, half, self._state]
         path = os.pathsep.join(place for place in sys.path if place)
         started = subprocess.Popen(  # type: ignore[call-overload]
             command,
@@ -140,61 +147,61 @@ class Compilers:
             self._lock.close()
 
 
-def compile_together(*, narrow: bool) -> None:
+def compile_together(state: str) -> None:
     """Fill the cache, in about two thirds of the time that one process takes; nothing where it is filled.
 
     Args:
-        narrow: see `Compilers`.
+        state: see `Compilers`.
     """
-    with Compilers(narrow=narrow) as compilers:
+    with Compilers(state) as compilers:
         compilers.wait()
-    mark = _mark(narrow)
+    mark = _mark(state)
     if mark and not mark.exists() and _cores() < 2:
         for half in ("codes", "counts"):
-            _compile(half, narrow=narrow)
+            _compile(half, state)
         mark.touch()
 
 
-def _mark(narrow: bool) -> Path | None:
+def _mark(state: str) -> Path | None:
     """The file that is there once the kernels of a state are; None where nothing can be kept."""
     folder = cache.folder() if hasattr(read, "py_func") else None  # it has none if numba is switched off
-    return folder / f"compiled-{'narrow' if narrow else 'wide'}" if folder else None
+    return folder / f"compiled-{state}" if folder else None
 
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _compile(half: str, *, narrow: bool, told: Callable[[], object] = lambda: None) -> None:
+def _compile(half: str, state: str, *, told: Callable[[], object] = lambda: None) -> None:
     """Compile one half; `told` is called where the second one needs what the first has compiled."""
     # Kernels are compiled for types, not for values.
     geometry = Geometry(patch=4, n_bins=1, bin_us=1_000)
-    encoder = random_encoder(0, geometry, 2, encoding="split", narrow=narrow)
-    assert encoder.is_narrow == narrow
+    formulation: Formulation = "inverse" if state == "lasso" else "direct"
+    encoder = random_encoder(0, geometry, 2, formulation, "split", narrow=state == "narrow")
+    assert state_of(encoder) == state
     event, resolution = make_events([0], [0], [1], [0]), (4, 4)
     operator = with_fixed_point(encoder.operator, encoder.geometry.grid_shape(resolution))
-    state = allocate_state(encoder.geometry, operator, resolution, origin_us=0, planes=1, threads=1)
+    arrays = allocate_state(encoder.geometry, operator, resolution, origin_us=0, planes=1, threads=1)
     if half == "codes":
         encoder.encode(event, resolution)
         told()
         return
-    count_events(event, operator, state)
+    count_events(event, operator, arrays)
     place_events(event, *resolution, 0, np.empty(1, np.int64), np.empty(2, np.int64))
-    mark_dirty(operator, state)
-    renew(_FIRST, _ALONE, operator, state)
-    settle(state)
+    mark_dirty(operator, arrays)
+    renew(_FIRST, _ALONE, operator, arrays)
+    settle(arrays)
     told()
-    read(operator, state, np.empty(n_features(encoder.operator), np.float32))
+    read(operator, arrays, np.empty(n_features(encoder.operator), np.float32))
 
 
 def _main(half: str, state: str) -> None:
     """One of the two processes: the first tells the second by the end of its output."""
-    narrow = state == "narrow"
     if half == "codes":
-        _compile(half, narrow=narrow, told=lambda: os.close(sys.stdout.fileno()))
+        _compile(half, state, told=lambda: os.close(sys.stdout.fileno()))
         return
-    _compile(half, narrow=narrow, told=sys.stdin.buffer.read)
-    mark = _mark(narrow)
+    _compile(half, state, told=sys.stdin.buffer.read)
+    mark = _mark(state)
     if mark:
         mark.touch()
 

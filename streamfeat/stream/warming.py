@@ -7,7 +7,7 @@ from streamfeat.engine.encoder import Encoder
 from streamfeat.events import make_events
 from streamfeat.messages.codecs import PAYLOAD_ENCODINGS, encode, make_decoder
 from streamfeat.messages.packets import Packet
-from streamfeat.stream.compiling import compile_together
+from streamfeat.stream.compiling import compile_together, state_of
 from streamfeat.stream.emission import EmitPolicy
 from streamfeat.stream.models import AnyClassifier
 from streamfeat.stream.session import Session
@@ -30,7 +30,7 @@ def warm_up(
         classifier: that they predict with.
         decoders: compile those of live payloads, too.
     """
-    compile_together(narrow=encoder.is_narrow)
+    compile_together(state_of(encoder))
     event = make_events([0], [0], [1], [0])
     if decoders:
         for encoding in PAYLOAD_ENCODINGS:

@@ -185,11 +185,11 @@ TASKS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 def compile_kernels() -> None:
     """Compile as a command does before its first packet, where the version has a way to."""
     try:
-        from streamfeat.stream.compiling import compile_together
+        from streamfeat.stream.compiling import STATES, compile_together
     except ImportError:
         return
-    for narrow in (False, True):
-        compile_together(narrow=narrow)
+    for state in STATES:
+        compile_together(state)
 
 
 def main() -> None:

@@ -314,7 +314,7 @@ MUTANTS = [
     Mutant(
         "a bin is kept that was not brought up to date",
         "engine/engine.py",
-        "                update_plane(self._operator, state, self._crew)\n                self._past",
+        "                update_plane(self._operator, self._state, self._crew)\n                self._past",
         "                self._past",
         SHORT,
     ),
@@ -759,6 +759,27 @@ MUTANTS = [
         "outside = (t < 0) | (t >= left_out.duration_us)",
         "outside = (t < 0) | (t > left_out.duration_us)",
         "tests/test_evaluate.py -k only_the_events_of_a_held_out",
+    ),
+    Mutant(
+        "a layer of HOTS sees the events of the camera",
+        "evaluate/surfaces.py",
+        "            p = layer.answers((x, y, p, t), resolution)\n",
+        "            p, _ = p % 2, layer.answers((x, y, p, t), resolution)\n",
+        "tests/test_evaluate.py -k later_layer",
+    ),
+    Mutant(
+        "surfaces of a chunk forget the events before it",
+        "evaluate/surfaces.py",
+        "            some = slice(start, start + _CHUNK)\n",
+        "            some, latest = slice(start, start + _CHUNK), self.blank(resolution)\n",
+        "tests/test_evaluate.py -k chunks_of_events",
+    ),
+    Mutant(
+        "descriptors of a chunk forget the events before it",
+        "evaluate/retina.py",
+        "            some = slice(start, start + _CHUNK)\n",
+        "            some, state = slice(start, start + _CHUNK), self.state(resolution)\n",
+        "tests/test_retina.py -k chunks_change_nothing",
     ),
     # live
     Mutant(
