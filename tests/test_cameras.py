@@ -87,3 +87,25 @@ def test_a_packet_that_cannot_be_used_costs_its_camera_no_more_than_its_window(m
     assert cameras.refused == {"unusable": 1}
     assert cameras.stats().events == 150
     assert cameras.topics == ["b", "a"]
+
+
+def test_cameras_work_ahead_in_turns_while_there_is_time():
+    now, rested = [0.0], []
+
+    class Slow(Session):
+        def rest(self):
+            rested.append(self._topic)
+            now[0] += 0.0006
+
+    cameras = Cameras(lambda topic: Slow(MODEL, EmitPolicy.parse("10ms"), topic=topic), clock=lambda: now[0])
+    cameras.rest()
+    run([replace(tiny.packet(tiny.steady(0, 5_000, 50)), topic=topic) for topic in "abc"], cameras)
+    for _ in range(3):
+        cameras.rest()
+    assert sorted(rested) == sorted("abc" * 2)
+    assert len(set(rested[:3])) == 3
+    now[0] += 1.0
+    rested.clear()
+    run([CameraLeft("a"), CameraLeft("b")], cameras)
+    cameras.rest()
+    assert rested == ["c"]

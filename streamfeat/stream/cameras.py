@@ -4,6 +4,7 @@ Lives here: which session an item goes to, how many there may be, and how one th
 Not here: what a session does (`session`), where items come from (`live`).
 """
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
@@ -18,6 +19,9 @@ __all__ = ["MAX_CAMERAS", "CameraLeft", "Cameras"]
 
 MAX_CAMERAS = 64
 """Topics served at a time; each holds an engine."""
+
+_REST_S = 0.001
+"""How long cameras work ahead before the next packet is looked for; the last of them may take longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +41,7 @@ class Cameras(Emitter):
         make_session: makes the session of a topic.
         limit: topics served at a time; packets of more are refused.
         on_refusal: told topic, reason and error.
+        clock: seconds, monotonic.
     """
 
     def __init__(
@@ -45,8 +50,10 @@ class Cameras(Emitter):
         *,
         limit: int = MAX_CAMERAS,
         on_refusal: Callable[[str, str, str], None] = lambda topic, reason, error: None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Start with no camera."""
+        self._clock, self._rested = clock, 0
         self._make_session = make_session
         self._limit = limit
         self._on_refusal = on_refusal
@@ -105,9 +112,14 @@ class Cameras(Emitter):
             del self._sessions[item.topic]
 
     def rest(self) -> None:
-        """Let every camera work ahead."""
-        for session in self._sessions.values():
-            session.rest()
+        """Let cameras work ahead in turns, as many as there is time for: packets of all of them wait."""
+        sessions = list(self._sessions.values())
+        until = self._clock() + _REST_S
+        for _ in sessions:
+            self._rested = (self._rested + 1) % len(sessions)
+            sessions[self._rested].rest()
+            if self._clock() >= until:
+                break
 
     def last_batches(self) -> Iterator[EmissionBatch]:
         """End every stream."""
