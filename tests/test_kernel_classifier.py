@@ -60,12 +60,12 @@ def test_it_is_kernel_ridge_regression():
     clf, fresh = trained(150), rings(20, seed=2)[0]
     targets = np.where(labels[:, None] == np.array(clf.labels), 1.0, -1.0)
     (machine,) = clf.machines
-    places = (normalise_features(features) - machine.mean) @ machine.axes
+    rows = normalise_features(features * machine.gains)
+    places = (rows - machine.mean) @ machine.axes
     ridge = KernelRidge(alpha=1e-2, kernel="rbf", gamma=machine.gamma).fit(places, targets)
-    expected = ridge.predict((normalise_features(fresh) - machine.mean) @ machine.axes)
+    expected = ridge.predict((normalise_features(fresh * machine.gains) - machine.mean) @ machine.axes)
     np.testing.assert_allclose(clf.scores(fresh), expected, atol=2e-3)
     # Not more axes than features: distances are those of the normalised features.
-    rows = normalise_features(features)
     np.testing.assert_allclose(
         np.linalg.norm(places[0] - places[1]), np.linalg.norm(rows[0] - rows[1]), rtol=1e-4
     )
@@ -100,13 +100,15 @@ def test_a_file_holds_both_classifiers(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "header", "reason"),
     [
-        ({"dual": np.zeros((3, 2), np.float32)}, {}, "dual is not float32 of shape"),
-        ({"axes": np.zeros((N, 3), np.float32)}, {}, "points is not float32 of shape"),
-        ({"points": np.zeros((0, 0), np.float32)}, {}, "points is not float32 of shape"),
-        ({"mean": np.full(N, np.nan, np.float32)}, {}, "mean is not finite"),
+        ({"dual.0": np.zeros((3, 2), np.float32)}, {}, "dual is not float32 of shape"),
+        ({"axes.0": np.zeros((N, 3), np.float32)}, {}, "points is not float32 of shape"),
+        ({"points.0": np.zeros((0, 0), np.float32)}, {}, "points is not float32 of shape"),
+        ({"mean.0": np.full(N, np.nan, np.float32)}, {}, "mean is not finite"),
+        ({"gains.0": np.full(N, -1, np.float32)}, {}, "gains must not be below zero"),
+        ({"gains.0": np.ones(1, np.float32)}, {}, "gains is not float32 of shape"),
         ({"bias": np.zeros(7, np.float32)}, {}, "bias is not float32"),
-        ({}, {"gamma": -1.0}, "gamma or the number"),
-        ({}, {"gamma": "wide"}, "gamma or the number"),
+        ({}, {"machines": [{"cells": [N], "gamma": -1.0}]}, "gamma or the number"),
+        ({}, {"machines": [{"cells": [N], "gamma": "wide"}]}, "gamma or the number"),
         ({}, {"version": 9}, "format version 9"),
     ],
 )
@@ -120,6 +122,43 @@ def test_unsound_files_are_refused(tmp_path, arrays, header, reason):
     with pytest.raises(InputError, match=reason) as refusal:
         load_classifier(tmp_path / "bad")
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_file_from_before_there_were_gains_has_the_same_scores(tmp_path, version):
+    clf, fresh = trained(60), rings(5, seed=4)[0]
+    machine = dataclasses.replace(clf.machines[0], gains=np.ones(N, np.float32))
+    clf = dataclasses.replace(clf, machines=(machine,))
+    clf.save(tmp_path / "now")
+    with safe_open(tmp_path / "now", framework="numpy") as file:
+        meta = json.loads(file.metadata()["streamfeat"]) | {"version": version}
+    arrays = load_file(tmp_path / "now")
+    del arrays["gains.0"]
+    if version == 1:  # one machine, whose arrays have no number
+        arrays = {name.removesuffix(".0"): array for name, array in arrays.items()}
+        meta["gamma"] = meta.pop("machines")[0]["gamma"]
+    save_file(arrays, tmp_path / "before", metadata={"streamfeat": json.dumps(meta)})
+    np.testing.assert_array_equal(load_classifier(tmp_path / "before").emitted(fresh), clf.emitted(fresh))
+    np.testing.assert_array_equal(
+        Classifier.load(tmp_path / "before").scores(fresh), clf.linear.scores(fresh)
+    )
+
+
+def test_features_that_a_linear_classifier_leans_on_have_gains():
+    features, labels = scales(400)
+    targets = np.where(labels[:, None] == np.array(["a", "b"]), np.float32(1), np.float32(-1))
+    gains = machine_module._gains(features[:, :24], (6,) * 4, targets)
+    assert gains.dtype == np.float32
+    assert gains.mean() == pytest.approx(1, rel=1e-5)
+    # Features at the same place of their cells have the same: the fourth tells, in the first of four cells.
+    assert np.array_equal(gains, np.tile(gains[:6], 4))
+    assert gains[:6].argmax() == 3
+    assert gains[3] > 3
+    # In cells of unlike sizes each feature is by itself.
+    alone = machine_module._gains(features[:, :24], (5, 19), targets)
+    assert (alone.argmax(), alone[9] < alone[3] / 3) == (3, True)
+    for rows, which in ((np.ones((6, 4), np.float32), targets[:6]), (features[:6, :4], 0 * targets[:6])):
+        assert np.array_equal(machine_module._gains(rows, (2, 2), which), np.ones(4))
 
 
 def test_files_that_are_no_classifier_are_refused(tmp_path):

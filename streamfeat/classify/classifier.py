@@ -38,7 +38,7 @@ FORMAT_VERSION = 1
 
 _KIND = "streamfeat-classifier"
 
-KERNEL_KIND, KERNEL_VERSION = "streamfeat-kernel-classifier", 2
+KERNEL_KIND, KERNEL_VERSION = "streamfeat-kernel-classifier", 3
 """Of files that have a kernel beside the linear classifier, and the latest version of those."""
 
 _POWERS = -9, 3
@@ -181,7 +181,8 @@ class Classifier(Shown):
         Raises:
             InputError: the file is missing, cut short, of another version, or not a classifier.
         """
-        arrays, header = read_safetensors(Path(path), (_KIND, KERNEL_KIND), FORMAT_VERSION, KERNEL_VERSION)
+        versions = {FORMAT_VERSION, *range(1, KERNEL_VERSION + 1)}
+        arrays, header = read_safetensors(Path(path), (_KIND, KERNEL_KIND), *versions)
         if header["format"] == KERNEL_KIND:
             header = {**header, "temperature": header.get("linear_temperature")}
         elif header["version"] != FORMAT_VERSION:
