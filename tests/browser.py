@@ -123,9 +123,11 @@ class Browser:
         return asked["result"].get("value")
 
     def until(self, expression: str) -> Any:
-        """Wait until an expression is true."""
+        """Wait until an expression is true; a page that is still loading has none of its names."""
         limit = time.monotonic() + PATIENCE_S
-        while not (value := self.value(expression)):
+        not_yet = "if (error instanceof ReferenceError) return false; throw error"
+        tried = f"(() => {{ try {{ return {expression} }} catch (error) {{ {not_yet} }} }})()"
+        while not (value := self.value(tried)):
             if time.monotonic() > limit:
                 raise RuntimeError(f"{expression} did not become true; the page says {self.problems}")
             self.value("new Promise((done) => setTimeout(done, 20))")
